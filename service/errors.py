@@ -312,7 +312,7 @@ class FormatRefused(AbbeError):
 
 
 class TableFileError(AbbeError):
-    """A control could not read this table file completely; the message names file, line and mistake."""
+    """A table file that a control could not read completely, or that is not its own; a message about a mistake names file and line."""
 
     code = "TAB-002"
 

@@ -100,8 +100,11 @@ class Solution:
             The shape is wrong, or a number is not finite.
         """
         points = np.atleast_2d(np.asarray(points_mm, dtype=np.float64))
-        if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
-            raise ValueError(f"points_mm: finite numbers of shape (n, 3) expected, got shape {np.shape(points_mm)}")
+        if points.ndim != 2 or points.shape[1] != 3:
+            raise ValueError(f"points_mm: expected shape (n, 3) or (3,), got {np.shape(points_mm)}")
+        bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
+        if bad.size:
+            raise ValueError(f"points_mm: row {bad[0] + 1} holds a number that is not finite")
         predicted = self._found.predict(points)
         return Deviation(predicted.deviation_mm, predicted.expanded_mm)
 

@@ -168,7 +168,7 @@ class SerialBallBar:
             if isinstance(error, LinkDown):
                 raise
             remedy = "end other programs, or raise the limit of open files"
-            raise LinkDown(self.name, "open", f"the line cannot be read: {error}", remedy) from error
+            raise LinkDown(self.name, "open", f"the connection was opened but cannot be read: {error}", remedy) from error
 
     async def identify(self) -> DeviceInfo:
         """Read identity and settings of the box, and accept its boot id as the current one.

@@ -1,7 +1,8 @@
 """Forward selection of missing effects with backward steps and a price for every parameter and label tried.
 
-A label is an effect with its key; a label of the catalogue is called a name. Before a candidate is compared, its non-linear parameters are
-refined between the starts of its grid (`refined`). Other names are tried in place of a chosen one on the same readings (`rivals_of`).
+A label is an effect with its key (axis or error motion); a label of the catalogue is called a name. Before a candidate is compared, its
+non-linear parameters are refined (`refined`): from its best start to the neighbouring starts, or close to its start if it is a structure
+without a name. Other names are tried in place of a chosen one on the same readings (`rivals_of`).
 """
 
 from __future__ import annotations
@@ -48,7 +49,10 @@ KIN = 0.02
 
 
 def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
-    """Optimise the non-linear parameters of ``pick`` one after the other, between the neighbouring starts; return the pick and its gain."""
+    """Optimise the non-linear parameters of ``pick`` one after the other; return the pick and its gain.
+
+    Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name.
+    """
     best = gain_of(problem, pick, rows)
     if not pick.effect.shape:
         return pick, best

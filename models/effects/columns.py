@@ -93,8 +93,9 @@ def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
 def of_body(deviation: Callable[[Path, Places, str, Values], F3], turn: Callable[[Path, Places, str, Values], F3]) -> Signal:
     """Do the same as `of_path` for a body that turns, and add the reading from the plane mirror that turns with it.
 
-    ``turn``: rotation of tool against workpiece, shape (rows, 3, k), rad per unit. If the beam n meets the mirror at an offset l from its
-    first spot, a rotation w adds (w x n).l to the reading: 50 mm times 20 urad is 1 um.
+    ``turn``: rotation of tool against workpiece, shape (rows, 3, k), rad per unit of each coefficient. After a travel l of the tool since
+    the reference, a rotation w since then adds (w x n).l to a laser's reading along the beam n, because the beam meets the mirror beside
+    its first spot: 50 mm times 20 urad is 1 um.
     """
 
     def read(path: Path, key: str, values: Values) -> F2:

@@ -250,9 +250,10 @@ def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
 
 
 def _rank(problem: CampaignProblem, order: int) -> Identifiability:
-    """Rank analysis of the terms up to ``order``, with lost motion and unstated set-up unknowns free; higher orders are left out.
+    """Analyse the rank of the terms up to ``order``; higher ones are left out.
 
-    The weights of hidden combinations are in units of typical sizes.
+    Free besides these: lost motion, and the set-up unknowns that `stated_knowledge` does not count as known. The weights of hidden
+    combinations are in units of typical sizes.
     """
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)

@@ -49,7 +49,7 @@ class ListedFile:
 
 @dataclass(frozen=True, slots=True)
 class ListedAudit:
-    """The audit of a backup: its records, whether its key is in the backup, and the faults found when it was copied."""
+    """The audit of a backup: number of its records, whether its key is in the backup, and the faults found when it was copied."""
 
     records: int
     key: bool

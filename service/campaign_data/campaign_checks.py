@@ -207,7 +207,9 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
     """
     bad = [f for f in issues if f.refuse]
     if bad:
-        more = f" (and {len(bad) - 1} more: {', '.join(sorted({f.run for f in bad[1:]}))})" if len(bad) > 1 else ""
+        runs = sorted({f.run for f in bad[1:]})
+        noun, where = f"issue{'s' * (len(bad) > 2)}", f"run{'s' * (len(runs) > 1)} {', '.join(runs)}"
+        more = f" (and {len(bad) - 1} more {noun}, in {where})" if runs else ""
         raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
 
 

@@ -315,7 +315,7 @@ class Pushing:
         why = known.why or ended.why
         detail = str(self._error) if self._error is not None else why
         if ended.state is not None and not ended.settled and ended.state is not PushState.ROLLBACK_PENDING:
-            raise StillActive(f"{detail}: {ended.why}", MAKE_READY) from self._error
+            raise StillActive(detail if detail == ended.why else f"{detail}; {ended.why}", MAKE_READY) from self._error
         match ended.state:
             case PushState.KEEP | PushState.ROLLED_BACK:
                 if self._error is not None:

@@ -110,7 +110,7 @@ def limit_memory(pid: int, memory_mb: int) -> None:
     except ProcessLookupError:
         pass  # gone already; its end is handled elsewhere
     except (OSError, ValueError) as error:
-        log.warning("the page's memory has no limit of its own", cause=str(error))
+        log.warning("no memory limit could be set for the page's process", cause=str(error))
 
 
 log = structlog.get_logger("abbe.web")

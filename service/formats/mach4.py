@@ -68,7 +68,8 @@ def _read_one(file: TextFile) -> AxisTable:
         if rows[-1][0] != len(rows) or abs(rows[-1][1] - wanted) > 1e-5:
             raise file.wrong(line, f"point {rows[-1][0]:g} at {rows[-1][1]:g}, expected point {len(rows)} at {wanted:g}")
     if len(rows) != count:
-        raise file.wrong(len(lines), f"{len(rows)} points, {count:g} stated: the file is cut off")
+        cut = ": the file is cut off" if len(rows) < count else ""
+        raise file.wrong(len(lines), f"{len(rows)} points, but the heading states {count:g}{cut}")
     table = np.array(rows)
     plus, minus = (SIGN.from_file(table[:, k], table[:, 1]) for k in (2, 3))
     return AxisTable(head["axis"], head["axis"], table[:, 1], plus, minus)

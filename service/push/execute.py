@@ -1,7 +1,7 @@
 """Run the push machine: get the next operation, do it through a port, learn from its outcome. Tests run the same loop on a model.
 
-`ControllerPort` is the port to a real controller: it turns each operation into one call of the driver, and errors of the driver into
-outcomes: Refused (nothing changed) or Doubt (the result is unknown). It decides nothing.
+`ControllerPort` is the port to a real controller: it turns each operation into calls of the driver or a question to `PushActors`, and
+errors of the driver into outcomes: Refused (nothing changed) or Doubt (the result is unknown). It decides nothing.
 """
 
 from __future__ import annotations

@@ -178,7 +178,10 @@ UNSCHEDULED: Doc = {
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Trends:
-    """Trends of a machine's figures over its checks with the table in force; ``verified``: the measurement that verified that table."""
+    """Trends of a machine's figures over its checks, by default those since the table in force became active.
+
+    ``verified``: whether a measurement supports that table, and which.
+    """
 
     machine: str
     figures: Sequence[FigureTrend] = ()

@@ -142,7 +142,7 @@ class StatusSource(Protocol):
         ...
 
     async def ready(self) -> None:
-        """Return if the service can store and show a check now; otherwise raise the reason."""
+        """Do nothing if the store is readable and the core has answered recently; otherwise raise the reason."""
         ...
 
 
@@ -162,7 +162,7 @@ class StatusReader:
         return await asyncio.to_thread(latest_checks, self.reader, limit)
 
     async def ready(self) -> None:
-        """Return if the store is readable and the core has answered recently; otherwise raise the reason."""
+        """Do nothing if the store is readable and the core has answered recently; otherwise raise the reason."""
         await self.verifications(1)
         _ = self._core.changes
 

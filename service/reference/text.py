@@ -38,7 +38,7 @@ def digits_like(value: float, number: Expected) -> str:
 
 
 def short(value: float) -> str:
-    """Return a number as text with two significant digits."""
+    """Return a number as text with at most two significant digits."""
     return minus("0" if value == 0.0 else f"{value:.1e}" if not 1e-3 <= abs(value) < 1e5 else f"{value:.2g}")
 
 

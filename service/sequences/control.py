@@ -321,7 +321,7 @@ class Control:
             await self.asked()
 
     async def unless_stopped(self, work: Awaitable[T]) -> T:
-        """Wait for a person's work; a stop or an abort cancels it. Raises as `check`."""
+        """Wait for work of any length, e.g. a person's answer; a stop or an abort cancels it. Raises as `check`."""
         task = asyncio.ensure_future(work)
         try:
             while not task.done():

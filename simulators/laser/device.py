@@ -112,7 +112,7 @@ class LaserDevice:
     # ---- people --------------------------------------------------------------------------------------------------
 
     def mount(self, beam: F, position_mm: F) -> None:
-        """Set up laser and mirror at the tool position (3,), beam along ``beam``; this clears the beam-lost latch."""
+        """Set up laser and mirror at the tool position (3,), beam along ``beam``; clears the beam-lost latch unless the beam is blocked."""
         self.output()
         nominal = beam / np.linalg.norm(beam)
         rng = generator(self._draws.seed, STREAM_MIRROR, self._mounts)

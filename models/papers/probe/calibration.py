@@ -39,14 +39,14 @@ def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROU
     Raises
     ------
     ValueError
-        Shapes do not agree, a number is not finite, the tolerance is not positive, or the directions form no such pattern: a node or the
-        pole has no touch or more than one.
+        Shapes do not agree, a number is not finite, the tolerance is not above 0 and below pi/4, or the directions form no such pattern: a
+        node or the pole has no touch or more than one.
     """
     angles, values = np.asarray(directions_rad, dtype=np.float64), np.asarray(values_mm, dtype=np.float64)
     if angles.ndim != 2 or angles.shape[1] != 2 or values.shape != angles.shape[:1]:
         raise ValueError(f"lobing map: directions {angles.shape} and values {values.shape} do not fit together, expected (n, 2) and (n,)")
     if not (np.isfinite(angles).all() and np.isfinite(values).all()) or not 0.0 < tolerance_rad < np.pi / 4:
-        raise ValueError("lobing map: all numbers must be finite and the tolerance positive")
+        raise ValueError(f"lobing map: all numbers must be finite, and the tolerance above 0 and below pi/4 rad, got {tolerance_rad:g}")
     pole = np.abs(angles[:, 0]) <= tolerance_rad
     if int(pole.sum()) != 1 or values.size < 2:
         raise ValueError(

@@ -1,7 +1,7 @@
 """Yang and Kim's complete volumetric model with all 21 errors, (1), as printed, and the readings of a ball-bar, (4)-(8).
 
-(1) is rule G for the chain `abbe.models.notation.yang.CHAIN`, written out term by term for comparison with the paper. Ball-bar readings are
-exact or of first order, with a bound on the difference.
+Equation (1) is the first-order deviation (rule G, docs/explanation/conventions.md) of the chain `abbe.models.notation.yang.CHAIN`, written
+out term by term for comparison with the paper. Ball-bar readings are exact or of first order, with a bound on the difference.
 """
 
 from __future__ import annotations

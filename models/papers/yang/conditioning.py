@@ -117,7 +117,7 @@ def fit_eq9(points_mm: F2, origin_mm: F1, delta_r_mm: F1, radius_mm: float, *, z
         raise ValueError(f"eq (9): a point lies {worst:g} mm from the origin, but the radius is {radius_mm:g} mm")
     scale = np.linalg.norm(a, axis=0)
     if not (scale > 0).all():
-        raise ValueError("eq (9): all points lie on a plane or line through the centre, so some parameters are not determined")
+        raise ValueError("eq (9): at every point at least one coordinate from the centre is zero, so some parameters are not determined")
     q, r = scipy.linalg.qr(a / scale, mode="economic")
     if np.abs(np.diag(r)).min() < 1e-9:
         raise ValueError("eq (9): the points do not determine the six parameters")

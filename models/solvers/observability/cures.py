@@ -343,7 +343,7 @@ def count_observed(observed: F2) -> int:
 
 
 def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[CureTrial]:
-    """Try every usual addition on the hidden combinations; return an empty list if there are none."""
+    """Try every usual addition, and return what each shows of the hidden combinations; an empty list if nothing is hidden."""
     if not observed.null_space.shape[1]:
         return []
     order = max(t.order for t in campaign.terms)

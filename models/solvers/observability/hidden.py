@@ -200,7 +200,7 @@ def _unit_length(vectors: F2) -> F2:
 
 
 def _independent(vectors: F2, reported: F2) -> tuple[F2, F2]:
-    """The vectors that are independent of those already reported; and an orthonormal basis of all reported so far."""
+    """Return the vectors that are independent of those already reported and of each other, and the orthonormal basis extended by them."""
     new = []
     for v in vectors.T:
         rest = _beside(v[:, None], reported)

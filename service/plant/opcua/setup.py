@@ -20,12 +20,18 @@ def check_opcua(setup: OpcUa) -> None:
     Raises
     ------
     ConfigError
-        Other computers could connect without encryption or a known certificate; a certificate cannot be read; asyncua is not installed.
+        Other computers could connect without encryption or a known certificate; clients cannot be recognised, as nothing is encrypted; a
+        certificate cannot be read; asyncua is not installed.
     """
     if setup.guarded and not (setup.certificate and setup.clients):
+        if setup.exposed:
+            raise ConfigError(
+                f"[opcua] host {setup.host!r} can be reached by other computers: it needs certificate, key and clients",
+                "give all three, or use 127.0.0.1 without clients",
+            )
         raise ConfigError(
-            f"[opcua] host {setup.host!r} needs certificate, key and clients: connections must be encrypted and clients known",
-            "give all three, or use 127.0.0.1 without clients",
+            "[opcua] clients needs certificate and key: a client is recognised only on an encrypted connection",
+            "give certificate and key, or leave clients out",
         )
     trusted(setup.clients)
     for name in (setup.certificate, setup.key):

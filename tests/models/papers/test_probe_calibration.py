@@ -241,7 +241,7 @@ def test_directions_that_form_no_pattern_are_said():
         (PATTERN, values[:50], 1e-9, "do not fit together"),
         (PATTERN[:, :1], values, 1e-9, "do not fit together"),
         (PATTERN, values * np.nan, 1e-9, "finite"),
-        (PATTERN, values, 0.0, "tolerance positive"),
+        (PATTERN, values, 0.0, "tolerance above 0"),
         (many, values, 0.02, "touches of colatitude 17.8763 to 85.9437 degrees are closer than the tolerance"),
         (PATTERN, values, np.deg2rad(10), "touches of colatitude"),
         (PATTERN[100:], values[100:], 1e-9, "exactly one touch at the pole; 1 of 1 touches are at the pole"),

@@ -112,7 +112,7 @@ def test_a_refusal_names_the_first_run_and_how_many_more():
     ]
     with pytest.raises(CampaignRefused) as told:
         refuse(findings)
-    assert str(told.value) == "run b: bad (and 1 more: c) - mend; nothing was stored"
+    assert str(told.value) == "run b: bad (and 1 more issue, in run c) - mend; nothing was stored"
     refuse(findings[:1])
 
 

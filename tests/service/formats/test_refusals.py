@@ -18,6 +18,7 @@ V = np.array([0.0, -0.010, 0.004])
 GOOD = Compensation((AxisTable("X", "X", P, V, V - 0.003),))
 TOLD = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
 
+MACH4 = "axis,X\nstart_mm,0\nlength_mm,10\npoints,3\npoint,position_mm,error_plus_mm,error_minus_mm\n"
 BAD_FILES = [
     ("linuxcnc-1", "x.comp", "# made by hand\n0 0 0\n100 0.01 0.01\n", r"x\.comp:1: .*ends the table here"),
     ("linuxcnc-1", "x.comp", "0 0 0\n\n100 0.01 0.01\n", r"x\.comp:2: the line is blank"),
@@ -37,12 +38,9 @@ BAD_FILES = [
     ("fanuc-pitch", "P.TXT", "%\nN10000Q1P1.5\n%\n", r"P\.TXT:2: "),
     ("heidenhain", "X.COM", "BEGIN X.COM MM\nNR AXISPOS X\n0 0 0\n1 0 0\n[END]\n", r"X\.COM:4: position 0 after 0"),
     ("heidenhain", "X.COM", "BEGIN X.COM MM\nNR AXISPOS X\n0 0 0\n", "cut off"),
-    (
-        "mach4",
-        "m.csv",
-        "axis,X\nstart_mm,0\nlength_mm,10\npoints,3\npoint,position_mm,error_plus_mm,error_minus_mm\n1,0,0,0\n2,9,0,0\n",
-        r"m\.csv:7",
-    ),
+    ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,9,0,0\n", r"m\.csv:7"),
+    ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n", "2 points, but the heading states 3: the file is cut off"),
+    ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n3,10,0,0\n4,15,0,0\n", "4 points, but the heading states 3 -"),
     ("centroid", "cnc-x.tab", "3 1000\n0\n1\n", "2 values, 3 stated"),
     ("fanuc-lattice", "l.csv", "x,y,z\n", r"l\.csv:1: the heading"),
     ("isg", "v.csv", "X EXX\n0 0\n10 0.1\n5 0.2\n", r"v\.csv:4: position 5 after 10"),

@@ -321,10 +321,10 @@ async def test_everybody_else_is_refused(tmp_path: Path, source: Source, guarded
 @pytest.mark.parametrize(
     ("setup", "words"),
     [
-        (OpcUa(host="0.0.0.0"), "needs certificate, key and clients"),
+        (OpcUa(host="0.0.0.0"), "reached by other computers: it needs certificate, key and clients"),
         (OpcUa(host="192.0.2.7", port=4840, certificate="c.pem", key="k.pem"), "needs certificate, key and clients"),
         (OpcUa(host="plant.example", port=4840), "needs certificate, key and clients"),
-        (OpcUa(clients=("x.pem",)), "needs certificate"),
+        (OpcUa(clients=("x.pem",)), "clients needs certificate and key"),
         (OpcUa(certificate="gone.pem", key="gone.key"), "no such file"),
         (OpcUa(host="0.0.0.0", port=4840, certificate="c.pem", key="k.pem", clients=("gone.pem",)), "clients: gone.pem"),
     ],
