@@ -13,6 +13,7 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.channel.messages import PAGE_MEMORY_MB
 from abbe.service.domain.machine import Chain, Interval, Point
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
@@ -43,6 +44,9 @@ def _certificate(day: date | None) -> date | None:
     return day
 
 
+Coefficient = Annotated[float, Field(ge=-1e-5, le=1e-4)]
+"""Expansion coefficient, 1/K: some glass ceramics and fibres shrink; a number in µm/m/K is above the largest."""
+CoefficientUncertainty = Annotated[float, Field(gt=0.0, le=1e-5)]
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
 MachineWindow = Annotated[Window, AfterValidator(complete)]
 EXCLUSIVE_KEYS = {
@@ -164,6 +168,65 @@ class Limits(Section):
     settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
         default=10.0, description="how long all conditions must be clear before the measurement resumes"
     )
+
+
+class AxisCoefficients(Section):
+    """One expansion coefficient for each axis, 1/K; an absent axis is not reduced."""
+
+    X: Coefficient | None = None
+    Y: Coefficient | None = None
+    Z: Coefficient | None = None
+
+
+class AxisUncertainties(Section):
+    """One standard uncertainty of a coefficient for each axis, 1/K."""
+
+    X: CoefficientUncertainty | None = None
+    Y: CoefficientUncertainty | None = None
+    Z: CoefficientUncertainty | None = None
+
+
+class Material(Section):
+    """Thermal expansion, to reduce figures of ISO 230-2 to 20 °C. Without a coefficient and a temperature nothing is reduced."""
+
+    scale_per_k: AxisCoefficients = Field(
+        default=AxisCoefficients(),
+        description="expansion coefficient of each axis' scale (without a scale: of its screw), 1/K, e.g. {X = 11.5e-6}",
+    )
+    u_scale_per_k: AxisUncertainties = Field(
+        default=AxisUncertainties(), description="its standard uncertainty, 1/K, for each axis with a coefficient, e.g. {X = 0.6e-6}"
+    )
+    temperature_c: Annotated[float, Field(ge=COLDEST_C, le=WARMEST_C)] | None = Field(
+        default=None, description="temperature of the scales, for runs that recorded none of their axis (temp_x_C, temp_y_C, temp_z_C)"
+    )
+    u_temperature_k: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
+        default=0.2, description="standard uncertainty of the scales' temperature, recorded or stated"
+    )
+    laser_per_k: Coefficient = Field(
+        default=0.0,
+        description="coefficient to which the laser's own compensation of material expansion is set, at the same temperature, 1/K; 0: it "
+        "is off, the laser reads true length",
+    )
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        for axis in "XYZ":
+            if (getattr(self.scale_per_k, axis) is None) != (getattr(self.u_scale_per_k, axis) is None):
+                raise ValueError(f"scale_per_k.{axis} and u_scale_per_k.{axis} belong together, expected both or neither")
+        return self
+
+    def by_axis(self) -> dict[str, AxisMaterial]:
+        """The section as reports use it, for each axis."""
+        return {
+            axis: AxisMaterial(
+                getattr(self.scale_per_k, axis),
+                getattr(self.u_scale_per_k, axis),
+                self.temperature_c,
+                self.u_temperature_k,
+                self.laser_per_k,
+            )
+            for axis in "XYZ"
+        }
 
 
 class Calibration(Section):
@@ -349,6 +412,7 @@ class MachineFile(Section):
     devices: Devices = Devices()
     store: StoreSection = StoreSection()
     limits: Limits = Limits()
+    material: Material = Material()
     calibration: Calibration = Calibration()
     nc: Nc = Nc()
     verify: Verify = Verify()

@@ -130,7 +130,7 @@ class Service:
             self._listening.getsockname()[1],
             setup.web.behind_tls,
             tuple(setup.schedules),
-            RulesSummary(**asdict(setup.rules)),
+            RulesSummary(**asdict(setup.rules) | {"materials": dict(setup.rules.materials)}),
             setup.summary,
             self._jobs.full.names,
             setup.web.memory_mb,

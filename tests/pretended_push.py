@@ -23,12 +23,13 @@ async def as_if_pushed(
     images: tuple[bytes, bytes],
     states: tuple[PushState, ...],
     control: str = "",
+    solution: int | None = None,
 ) -> None:
     """Write the entries. ``images``: of the table that goes and of the one that comes; ``doc``: what is kept with the latter; ``control``:
-    identity of the control, empty as older versions wrote.
+    identity of the control, empty as older versions wrote; ``solution``: from which the new table was computed.
     """
     base, image = images
-    table = store.tables.add(store.machines.add(machine, {"name": machine}), None, image, crc32(image), doc)
+    table = store.tables.add(store.machines.add(machine, {"name": machine}), solution, image, crc32(image), doc)
     known = {"table": table, "base_image": base.hex(), "base_crc": crc32(base), "base_bank": 0, "image": image.hex()}
     known |= {"crc": crc32(image), "target": 1, "base_meaning": "b", "meaning": "m", "owner": 0x00770000}
     known |= {"boot": 0x7FFFFFFF, "gen": 1, "map": "", "limits": "", "level": 3, "attended": True, "chunk_words": 100}

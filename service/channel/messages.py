@@ -13,7 +13,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import date
 from typing import Annotated, Literal, Self, TypeVar
 
@@ -21,6 +21,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken
@@ -44,11 +45,12 @@ Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
 
 @dataclass(frozen=True, slots=True)
 class RulesSummary:
-    """Limits, certificates and allowed temperature from the machine file, as reports use them."""
+    """Limits, certificates, allowed temperature and expansion of the scales from the machine file, as reports use them."""
 
     limits_um: dict[str, float]
     calibrated_until: dict[str, date] | None
     temperature_c: tuple[float, float] | None
+    materials: dict[str, AxisMaterial] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)

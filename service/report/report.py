@@ -24,12 +24,12 @@ NUMBERED = ("push", "discovery", "verification")
 
 
 def rules_of(config: MachineFile | None) -> Rules:
-    """Limits of the check, certificates and allowed temperature from a machine file; empty without a file."""
+    """Limits of the check, certificates, allowed temperature and expansion from a machine file; empty without a file."""
     if config is None:
         return Rules()
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     days = {"ballbar": config.calibration.ballbar, "laser": config.calibration.laser}
-    return Rules(limits, {k: v for k, v in days.items() if v is not None}, config.limits.temperature_c)
+    return Rules(limits, {k: v for k, v in days.items() if v is not None}, config.limits.temperature_c, config.material.by_axis())
 
 
 def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:

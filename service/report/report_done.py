@@ -22,10 +22,12 @@ from abbe.service.report.blocks import picture_section
 from abbe.service.report.later_changes import with_later_changes
 from abbe.service.report.report_parts import Doc, Rules
 from abbe.service.report.report_table import table_remarks
+from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.iso_report import Evaluated, evaluate
+from abbe.service.verification.reduction import holds_at
 from abbe.service.verification.verify import COVERAGE
 
 MANY = 10**6
@@ -55,7 +57,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     machine = store.machines.get(record.machine_id)
     campaign = None if record.campaign_id is None else from_store(store, store.campaigns.find(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
-    evaluated = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"))
+    evaluated = Evaluated() if campaign is None else evaluate(runs, campaign.doc.get("instruments"), rules.materials)
     table = table_remarks(store, machine.name, runs)
     figures = verification_figures(record, rules)
     condition, remarks = parts.conditions(runs, rules)
@@ -72,7 +74,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
         verdict=verdict,
         figures=[*figures, *evaluated.figures],
         instruments=_instruments(campaign, rules),
-        conditions=condition,
+        conditions=condition | evaluated.conditions,
         not_observable=evaluated.not_observable if campaign is not None else ["the readings: no campaign is stored with this verification"],
         remarks=[*table.remarks, *evaluated.remarks, *remarks],
         statements=[parts.VERIFICATION_STATEMENT, *evaluated.statements],
@@ -135,7 +137,7 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     document = Document(
         kind="push",
         title=f"Push {number} into {machine}",
-        about=parts.machine_facts(doc) | _about(store, journal, known),
+        about=parts.machine_facts(doc) | _about(store, journal, known) | _holds_at(store, known, rules),
         verdict=_verdict(journal, known),
         figures=[f for v in verified for f in verification_figures(v, rules)] + _sizes(tables),
         instruments=[i for c in campaigns[:1] for i in parts.instruments(c.runs, c.doc, rules)],
@@ -174,6 +176,15 @@ def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict
     )
     found = {"Approved by": known.approved_by, "Proof of sign, axis and unit": known.probe, "Verification": known.verify}
     return out | {name: text for name, text in found.items() if text}
+
+
+def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:
+    """At which temperature of the scales the new table holds: that of the runs it was computed from. Tables are not reduced to 20 °C."""
+    solution_id = store.tables.get(known.table).solution_id if known.table else None
+    if solution_id is None:
+        return {}
+    runs = [load_run(store, number) for number in store.solutions.get(solution_id).run_ids]
+    return {"Table holds at": holds_at(runs, rules.materials) or "unknown: no temperature of the scales is on record or stated"}
 
 
 def _verdict(journal: Sequence[PushEntry], known: PushFacts) -> tuple[Sign, str, str]:

@@ -68,7 +68,7 @@ class Measured:
 def campaign_report(found: Measured, rules: Rules) -> Document:
     """Report of a campaign: figures by ISO 230, figures of a verification, the solution."""
     campaign = found.campaign
-    evaluated = evaluate(campaign.runs, campaign.doc.get("instruments"))
+    evaluated = evaluate(campaign.runs, campaign.doc.get("instruments"), rules.materials)
     checked, verdict = _verification(campaign.runs, rules)
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)
@@ -80,7 +80,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
         verdict=found.table.verdict(parts.verdict_of(verdict, remarks, _solution_verdict(found.solution))),
         figures=[*checked, *solved.figures, *evaluated.figures],
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),
-        conditions=condition,
+        conditions=condition | evaluated.conditions,
         not_observable=[*solved.not_observable, *evaluated.not_observable],
         remarks=remarks,
         statements=[*solved.statements, *([parts.VERIFICATION_STATEMENT] if checked else []), *evaluated.statements],
@@ -98,7 +98,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
 def run_report(found: Measured, label: str, rules: Rules) -> Document:
     """Report of one run: figures by ISO 230, and its readings."""
     run = next(r for r in found.campaign.runs if r.run_id == label)
-    evaluated = evaluate([run], found.campaign.doc.get("instruments"))
+    evaluated = evaluate([run], found.campaign.doc.get("instruments"), rules.materials)
     condition, remarks = parts.conditions([run], rules)
     own, why = _own(run), not_judged(run)
     setup = [(k, _value_text(v)) for k, v in sorted(run.setup.document.items())]
@@ -109,7 +109,7 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
         verdict=found.table.verdict(("open", "Not judged", f"{why}." if why else NOT_JUDGED)),
         figures=[*own.figures, *evaluated.figures],
         instruments=parts.instruments([run], found.campaign.doc, rules),
-        conditions=condition,
+        conditions=condition | evaluated.conditions,
         not_observable=[*own.not_observable, *evaluated.not_observable],
         remarks=[*found.table.remarks, *_unfinished(found.states, [run]), *evaluated.remarks, *remarks],
         statements=evaluated.statements,

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
@@ -42,11 +43,16 @@ SENSORS = (
 
 @dataclass(frozen=True, slots=True)
 class Rules:
-    """Rules from a machine file: limits of figures (µm, named as in `figure_rows`), certificates, allowed temperature."""
+    """Rules from a machine file.
+
+    ``limits_um``: of figures, named as in `figure_rows`; ``calibrated_until``: certificates; ``temperature_c``: allowed, of the air;
+    ``materials``: expansion of the scales by axis.
+    """
 
     limits_um: Mapping[str, float] = field(default_factory=dict)
     calibrated_until: Mapping[str, date] | None = None
     temperature_c: tuple[float, float] | None = None
+    materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
 
 
 def machine_facts(machine: Doc) -> dict[str, str]:

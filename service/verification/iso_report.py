@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
@@ -12,8 +12,10 @@ import numpy as np
 from abbe.models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
 from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
 from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
+from abbe.models.evaluation.reduction import reduced
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Picture, ReportFigure
 from abbe.service.rendering.model import PolarTrace
@@ -22,14 +24,15 @@ from abbe.service.rendering.plots.curves import PositioningCurves, positioning_p
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.runs.coverage import not_judged
 from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
+from abbe.service.verification.reduction import AT_20, REDUCTION_STATEMENT, Reduction, budgets, reduction_of
 
 UM = 1e3
 POLAR_POINTS = 720
 LASER_STATEMENT = (
     "U of ISO 230-2 and 230-6 figures includes the scatter of the cycles, as far as repeats show it, the wavelength ({wave:g} µm/m), the "
-    "temperature of the scales (known to {kelvin:g} K at {expansion:g} µm/m/K) and the resolution, propagated through the figure's own "
-    "formula (idea of ISO/TR 230-9). Deviations are as measured, not reduced to 20 °C. Where there is one cycle, "
-    "the scatter is that of the reversals about their mean."
+    "temperature of the scales ({kelvin:g} K at {expansion:g} µm/m/K, or as stated for a reduced test) and the resolution, propagated "
+    "through the figure's own formula (idea of ISO/TR 230-9). Deviations are as measured, except in groups that say at 20 °C. Where there "
+    "is one cycle, the scatter is that of the reversals about their mean."
 )
 BAR_STATEMENT = (
     "U of ISO 230-4 figures includes the noise of a reading, {repeat:g} µm for remounting the bar (an assumption) and, for F alone, "
@@ -39,16 +42,22 @@ BAR_STATEMENT = (
 
 @dataclass
 class Evaluated:
-    """Results of evaluated runs for a report; ``statements`` are part of the uncertainty statement."""
+    """Results of evaluated runs for a report.
+
+    ``statements`` are part of the uncertainty statement; ``conditions`` tell of each test of ISO 230-2 how it was reduced to 20 °C.
+    """
 
     figures: list[ReportFigure] = field(default_factory=list)
     pictures: list[Picture] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     not_observable: list[str] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
+    conditions: dict[str, str] = field(default_factory=dict)
 
 
-def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> Evaluated:
+def evaluate(
+    runs: Sequence[Run], instruments: dict[str, Any] | None = None, materials: Mapping[str, AxisMaterial] | None = None
+) -> Evaluated:
     """Evaluate every run that is a test of ISO 230-2, 230-4 or 230-6.
 
     Parameters
@@ -57,6 +66,8 @@ def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> 
         As measured.
     instruments : dict, optional
         ``instruments`` of the campaign file, for their resolutions.
+    materials : mapping, optional
+        Expansion of the scales by axis, from the machine file; without it nothing is reduced to 20 °C.
     """
     out = Evaluated()
     budget = scale_budget(instruments or {})
@@ -65,7 +76,8 @@ def evaluate(runs: Sequence[Run], instruments: dict[str, Any] | None = None) -> 
     linear, along, circles = linear_tests(runs, refused), diagonal_tests(runs, refused), circle_tests(runs, refused)
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
     for test in linear:
-        _axis(out, test, budget)
+        its_runs = [run for run in runs if run.run_id in test.runs]
+        _axis(out, test, budget, reduction_of(its_runs, test.name, materials or {}))
     for plane, tests in along.items():
         _diagonals(out, plane, tests, budget)
     if linear or along:
@@ -85,17 +97,35 @@ def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
     return ScaleBudget(scale, float((instruments.get("laser") or {}).get("resolution_mm", 0.0)) / np.sqrt(12.0))
 
 
-def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget) -> None:
-    found = positioning(test.readings, budget)
-    group = f"Axis {test.name}, set-up {test.setup}: positioning, ISO 230-2"
-    out.figures += [_figure(group, *row, "ISO 230-2") for row in _rows(found)]
-    out.pictures.append(_positioning(f"{test.name} {test.setup}", f"position of {test.name} in mm", found))
+def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduction) -> None:
+    found = _as_measured_and_at_20(out, test, budget, reduction)
     runs = ", ".join(test.runs)
     if found.lowest != found.most:
         out.remarks.append(f"axis {test.name} ({runs}): positions have {found.lowest} to {found.most} approaches from one side")
     out.remarks += [f"axis {test.name} ({runs}): {note}" for note in (*found.departures(), *test.notes)]
     if found.R is None:
         out.not_observable.append(f"repeatability and accuracy of axis {test.name}: every position was approached once from each side")
+
+
+def _as_measured_and_at_20(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduction) -> Positioning:
+    """Add the figures as measured and, where the temperature is known, those at 20 °C before them; return those as measured."""
+    group, label, x_label = f"Axis {test.name}, set-up {test.setup}", f"{test.name} {test.setup}", f"position of {test.name} in mm"
+    out.conditions[f"{AT_20}, axis {label}"] = reduction.text
+    if reduction.expansion is None or reduction.temperature is None:
+        found = positioning(test.readings, budget)
+        out.figures += [_figure(f"{group}: positioning, ISO 230-2", *row, "ISO 230-2") for row in _rows(found)]
+        out.pictures.append(_positioning(label, x_label, found))
+        out.remarks.append(f"axis {test.name} ({', '.join(test.runs)}): {reduction.text}")
+        return found
+    measured, at_20 = budgets(budget, reduction.expansion, StatedInputs().u_wavelength)
+    found, result = positioning(test.readings, measured), positioning(reduced(test.readings, reduction.expansion), at_20)
+    out.figures += [_figure(f"{group}: positioning at 20 °C, ISO 230-2", *row, "ISO 230-2, at 20 °C") for row in _rows(result)]
+    as_read = f"{group}: positioning as measured at {reduction.temperature.text}"
+    out.figures += [_figure(as_read, *row, "ISO 230-2, as measured") for row in _rows(found)]
+    out.pictures += [_positioning(f"{label} at 20 °C", x_label, result), _positioning(f"{label} as measured", x_label, found)]
+    if REDUCTION_STATEMENT not in out.statements:
+        out.statements.append(REDUCTION_STATEMENT)
+    return found
 
 
 def _rows(p: Positioning) -> list[tuple[str, str, Value | None]]:

@@ -39,12 +39,13 @@ def report(
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
-    --machine FILE: use this machine file's database, limits, certificates and allowed temperature. Nothing is measured or computed
-    again; the same data give the same bytes.
+    --machine FILE: use this machine file's database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2
+    is reduced to 20 °C. Nothing is measured or computed again; the same data give the same bytes.
     """
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
     from abbe.service.report.report import rules_of
+    from abbe.service.verification.reduction import AT_20
 
     for target in out or []:
         form_of(target)  # refuse a wrong suffix before the work
@@ -57,6 +58,9 @@ def report(
         typer.echo(f"report: {target}")
     _, word, text = document.verdict or ("", "", "")
     typer.echo(f"{document.title}: {word}. {text}".strip())
+    for name, told in document.conditions.items():
+        if name.startswith(AT_20):
+            typer.echo(f"{name}: {told}.")
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:

@@ -147,7 +147,7 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
         reader=reader,
         schedules=begin.schedules,
         devices=lambda: core.devices,
-        rules=Rules(**asdict(begin.rules)),
+        rules=Rules(**asdict(begin.rules) | {"materials": begin.rules.materials}),
         tail=capture_log(),
     )
     app = create_app(view, version=begin.version, hosts=begin.hosts, auth=auth, parts=parts, plant=plant, api=api)

@@ -22,6 +22,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreSilent
@@ -77,7 +78,7 @@ CORE = [
         8080,
         False,
         (),
-        m.RulesSummary({}, None, None),
+        m.RulesSummary({}, None, None, {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)}),
         m.MachineSummary("w-Y-X-b-Z-t", {"X": (0.0, 600.0)}, {"X": (0.0, 0.0, 0.0)}, (0.0, 0.0, 150.0), 6000.0),
         ("identification",),
         1024,

@@ -1,0 +1,89 @@
+"""Reduction of positioning deviations to 20 °C: correction of the nominal differential expansion (NDE) of scale and laser.
+
+ISO 230-2 (2014, clause 4.1, Environment) wants results as if everything were at 20 °C, the reference temperature of ISO 1: measured at
+another temperature, they are corrected for the nominal differential expansion between the axis' measuring system and the test equipment.
+Uncertainty as in ISO/TR 16015: temperature and coefficients are independent contributions.
+
+Convention. Displacements and deviations grow with the axis coordinate; deviation = displacement read - displacement commanded. At t °C a
+scale of coefficient a moves the axis by (1 + a (t - 20)) for each commanded mm. A laser reads true length, so its coefficient is 0. If its
+own compensation of material expansion is on, it has already taken off b (t - 20) for each mm at the same temperature; b is its coefficient.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.evaluation.iso230_2 import Approaches
+
+REFERENCE_C = 20.0
+"""Reference temperature of length, ISO 1."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expansion:
+    """Expansion of one axis' scale against the laser during a test. Every ``u_`` is a standard uncertainty.
+
+    ``scale_per_k``: expansion coefficient of the scale, or of the screw of an axis without a scale, 1/K; ``temperature_c``: its
+    temperature, °C, and ``u_temperature_k`` in K; ``laser_per_k``: coefficient of the laser's own compensation of material, 1/K, 0: off.
+    """
+
+    scale_per_k: float
+    u_scale_per_k: float
+    temperature_c: float
+    u_temperature_k: float
+    laser_per_k: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse what is not a number.
+
+        Raises
+        ------
+        ValueError
+            A value is not finite, or an uncertainty is negative.
+        """
+        for name in self.__slots__:
+            value = getattr(self, name)
+            if not np.isfinite(value) or (name.startswith("u_") and value < 0.0):
+                raise ValueError(f"reduction to 20 °C: {name} is {value}, expected a finite number" + ", 0 or more" * name.startswith("u_"))
+
+    @property
+    def rise_k(self) -> float:
+        """Temperature above 20 °C, K; negative below."""
+        return self.temperature_c - REFERENCE_C
+
+    @property
+    def strain(self) -> float:
+        """What the temperature added to the deviation, mm per mm of travel: (scale - laser) (t - 20); positive: the axis goes too far."""
+        return (self.scale_per_k - self.laser_per_k) * self.rise_k
+
+    @property
+    def u_as_measured(self) -> float:
+        """Standard uncertainty of the deviation as measured at exactly ``temperature_c``, mm per mm: |scale - laser| u(t)."""
+        return abs(self.scale_per_k - self.laser_per_k) * self.u_temperature_k
+
+    @property
+    def u_reduced(self) -> float:
+        """Standard uncertainty of the reduction, mm per mm of travel (ISO/TR 16015, first order).
+
+        u² = ((scale - laser) u(t))² + ((t - 20) u(scale))². The laser's coefficient is a set number and adds nothing.
+        """
+        return float(np.hypot(self.u_as_measured, self.rise_k * self.u_scale_per_k))
+
+
+def reduced(readings: Approaches, expansion: Expansion) -> Approaches:
+    """Return the same approaches with deviations as at 20 °C.
+
+    Deviation at 20 °C = deviation as measured - (scale - laser) (t - 20) (position - first position). Both directions and all cycles of a
+    position change by the same amount, so that reversal and repeatability stay; the first position is the zero of the correction.
+
+    Parameters
+    ----------
+    readings : Approaches
+        As measured, mm.
+    expansion : Expansion
+        One temperature for the whole test.
+    """
+    taken_off = (expansion.strain * (readings.position_mm - readings.position_mm[0]))[:, None]
+    return replace(readings, forward_mm=readings.forward_mm - taken_off, backward_mm=readings.backward_mm - taken_off)

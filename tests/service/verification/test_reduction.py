@@ -1,0 +1,168 @@
+"""ISO 230-2 at 20 °C: which temperature and coefficient count, what the report shows, and what it says where it does not reduce."""
+
+import csv
+import io
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abbe.service.cli import run
+from abbe.service.clock import SystemClock
+from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.run import Run
+from abbe.service.report.report_done import push_report
+from abbe.service.report.report_parts import Rules
+from abbe.service.runs.exchange import import_folder
+from abbe.service.storage.store import Store
+from abbe.service.verification.iso_report import Evaluated, evaluate
+from abbe.service.verification.reduction import AT_20, REDUCTION_STATEMENT, holds_at
+from tests.pretended_push import KEPT, as_if_pushed
+from tests.run_documents import run_of
+
+AT = np.array([0.0, 250.0, 500.0, 750.0, 1000.0])
+STEEL = AxisMaterial(11.5e-6, 0.6e-6, 24.0, 0.2, 0.0)
+WAVELENGTH = 0.3e-6
+MACHINE = """
+name = "one"
+chain = "w-b-X-Y-Z-t"
+short_strokes = true
+[stroke_mm]
+X = [-4.0, 4.0]
+Y = [-4.0, 4.0]
+Z = [-4.0, 4.0]
+[material]
+scale_per_k = {X = 11.5e-6}
+u_scale_per_k = {X = 0.6e-6}
+temperature_c = 24.0
+"""
+
+
+def line(temperature_c: float | None = None, spread_k: float = 0.0) -> Run:
+    """A perfect steel axis of 1 m at 24 °C, five cycles, read by a laser without noise: 46 µm too long."""
+    x = np.tile(np.concatenate([AT, AT[::-1]]), 5)
+    columns = {"t_s": np.arange(50.0).tolist(), "x_mm": x.tolist(), "y_mm": [0.0] * 50, "z_mm": [0.0] * 50, "feed_mm_min": [60.0] * 50}
+    columns |= {"direction": ([1] * 5 + [-1] * 5) * 5, "deviation_mm": (46e-6 * x).tolist()}
+    if temperature_c is not None:
+        columns["temp_x_C"] = (temperature_c + np.linspace(-0.5, 0.5, 50) * spread_k).tolist()
+    setup = {
+        "setup_id": "L",
+        "t_set_s": 0.0,
+        "axis": "X",
+        "start_mm": [0.0] * 3,
+        "end_mm": [1000.0, 0.0, 0.0],
+        "nominal_beam": [1.0, 0.0, 0.0],
+    }
+    machine = {"name": "m", "chain": "w-b-X-Y-Z-t", "vertical_axis": "Z", "stroke_mm": {"X": [0, 1000], "Y": [0, 1], "Z": [0, 1]}}
+    head = {"format": "abbe-run/1", "campaign": "c", "run_id": "r", "test": "laser_linear", "role": "identify"}
+    return run_of(head | {"machine": machine, "setup": setup, "columns": columns})
+
+
+def figures(told: Evaluated, word: str, symbol: str = "E") -> list[tuple[float, float]]:
+    return [(f.value, f.u) for f in told.figures if word in f.group and f.symbol == symbol]
+
+
+def test_both_values_and_both_uncertainties_in_micrometres() -> None:
+    """By hand, 1 m: 11.5 · 4 = 46 µm. u as measured: 11.5 · 0.2 = 2.3 and wavelength 0.3; reduced: also 4 · 0.6 = 2.4.
+
+    The reduced deviations are all zero, so that their extremes lie at one place and show no uncertainty of length; A does likewise.
+    """
+    told = evaluate([line()], None, {"X": STEEL})
+    assert figures(told, "as measured at 24.00 ± 0.40 °C") == [(pytest.approx(46.0), pytest.approx(np.hypot(2.3, 0.3)))]
+    assert [v for v, _ in figures(told, "at 20 °C, ISO 230-2")] == [pytest.approx(0.0, abs=1e-9)]
+    twice = evaluate([line()], None, {"X": AxisMaterial(23e-6, 0.6e-6, 24.0, 0.1, 0.0)})
+    assert figures(twice, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.sqrt(2.3**2 + 2.4**2 + 0.3**2)))]
+    assert REDUCTION_STATEMENT in told.statements
+    assert told.conditions[f"{AT_20}, axis X L"].startswith("reduced from 24.00 ± 0.40 °C (stated in the machine file) with 11.5 ± 1.2 µm")
+
+
+def test_the_sensor_of_the_axis_counts_before_the_stated_temperature() -> None:
+    """Recorded 24 °C, stated 30 °C. A range of 0.6 K, rectangular, adds 0.6/√12 = 0.1732 K to 0.2 K: U is 2 · 0.2646 = 0.53 K."""
+    told = evaluate([line(24.0, spread_k=0.6)], None, {"X": AxisMaterial(11.5e-6, 0.6e-6, 30.0, 0.2, 0.0)})
+    assert figures(told, "as measured at 24.00 ± 0.53 °C") == [(pytest.approx(46.0), pytest.approx(np.hypot(11.5 * np.sqrt(0.07), 0.3)))]
+    assert "recorded in the runs" in told.conditions[f"{AT_20}, axis X L"]
+
+
+def test_what_the_laser_took_off_is_not_taken_off_twice() -> None:
+    """Laser's compensation set to the scale's coefficient: what it shows is already at 20 °C, and only the coefficient stays uncertain."""
+    told = evaluate([line()], None, {"X": AxisMaterial(11.5e-6, 0.6e-6, 24.0, 0.2, 11.5e-6)})
+    assert figures(told, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.hypot(2.4, 0.3)))]
+    assert figures(told, "as measured") == [(pytest.approx(46.0), pytest.approx(0.3))]
+
+
+@pytest.mark.parametrize(
+    ("made", "materials", "why"),
+    [
+        (line(), {}, "not reduced to 20 °C: no material temperature"),
+        (line(), {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)}, "not reduced to 20 °C: no material temperature"),
+        (line(24.0), {}, "no expansion coefficient of the scale; the figures hold at 24.00 ± 0.40 °C (recorded in the runs)"),
+        (line(), {"Y": STEEL}, "not reduced to 20 °C: no material temperature"),
+    ],
+)
+def test_without_temperature_or_coefficient_nothing_is_reduced_and_the_report_says_why(made, materials, why) -> None:
+    told = evaluate([made], None, materials)
+    assert list(dict.fromkeys(f.group for f in told.figures)) == ["Axis X, set-up L: positioning, ISO 230-2"]
+    assert any(why in line for line in told.remarks)
+    assert REDUCTION_STATEMENT not in told.statements
+
+
+def test_at_which_temperature_a_table_of_these_runs_holds() -> None:
+    assert holds_at([line(24.0)], {}) == "X 24.00 ± 0.40 °C (recorded in the runs)"
+    assert holds_at([line()], {"X": STEEL}) == "X 24.00 ± 0.40 °C (stated in the machine file)"
+    assert holds_at([line()], {}) == ""
+
+
+@pytest.mark.parametrize(
+    ("materials", "text"),
+    [
+        ({"X": STEEL}, "X 24.00 ± 0.40 °C (stated in the machine file)"),
+        ({}, "unknown: no temperature of the scales is on record or stated"),
+    ],
+)
+async def test_a_push_report_says_at_which_temperature_its_table_holds(shared: Path, tmp_path: Path, materials, text) -> None:
+    with Store.open(f"sqlite:///{tmp_path / 'a.sqlite3'}") as store:
+        import_folder(store, shared / "data" / "axis-tests" / "week42-x")
+        campaign = store.campaigns.find("week42-x")
+        machine = store.machines.get(campaign.machine_id)
+        solution = store.solutions.add(campaign.id, "joint", [r.id for r in store.runs.all(campaign.id)], {})
+        clock = SystemClock()
+        await as_if_pushed(store, clock, "one", {}, (b"of May", b"of June"), KEPT, solution=solution)
+        store.machines.add("one", machine.doc)
+        told = push_report(store, "one", 1, Rules(materials=materials))
+        assert told.about["Table holds at"] == text
+        await as_if_pushed(store, clock, "one", {}, (b"of June", b"of July"), KEPT)
+        assert "Table holds at" not in push_report(store, "one", 2, Rules(materials=materials)).about
+
+
+def test_every_form_of_the_report_shows_both(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """The steepest line between the deciding places is 2 mm long there: E+ grows by 46 µm/m · 2 mm = 0.092 µm."""
+    machine, out = tmp_path / "machine.toml", [tmp_path / f"x.{form}" for form in ("html", "csv", "json")]
+    machine.write_text(MACHINE, encoding="utf-8")
+    words = ["report", str(shared / "data" / "axis-tests" / "week42-x"), "--machine", str(machine)]
+    assert run([*words, *(w for path in out for w in ("--out", str(path)))]) == 0
+    assert "ISO 230-2 at 20 °C, axis X L: reduced from 24.00 ± 0.40 °C" in capsys.readouterr().out
+    page = out[0].read_text(encoding="utf-8")
+    assert "positioning at 20 °C, ISO 230-2" in page
+    assert "positioning as measured at 24.00 ± 0.40 °C" in page
+    rows = {(r["method"], r["symbol"]): r for r in csv.DictReader(io.StringIO(out[1].read_text(encoding="utf-8")))}
+    at_20, as_read = rows["ISO 230-2, at 20 °C", "E+"], rows["ISO 230-2, as measured", "E+"]
+    assert float(at_20["value"]) - float(as_read["value"]) == pytest.approx(0.092, abs=1e-9)
+    assert float(at_20["expanded"]) > float(as_read["expanded"]) > 0.0
+    doc = json.loads(out[2].read_text(encoding="utf-8"))
+    assert any(name.startswith(AT_20) for name in doc["conditions"])
+    assert {f["method"] for f in doc["figures"]} == {"ISO 230-2, at 20 °C", "ISO 230-2, as measured"}
+
+
+def test_a_coefficient_in_other_units_or_without_uncertainty_is_one_line(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    machine = tmp_path / "machine.toml"
+    for old, new, says in (
+        ("X = 11.5e-6", "X = 11.5", "material.scale_per_k.X: expected "),
+        ("u_scale_per_k = {X = 0.6e-6}", "", "scale_per_k.X and u_scale_per_k.X belong together"),
+        ("temperature_c = 24.0", "temperature_c = 75.2", "material.temperature_c: expected "),
+    ):
+        machine.write_text(MACHINE.replace(old, new, 1), encoding="utf-8")
+        assert run(["check-config", str(machine)]) == 2
+        told = capsys.readouterr().err.strip()
+        assert says in told
+        assert len(told.splitlines()) <= 2
