@@ -178,6 +178,9 @@ class ModbusWire:
         if client is None:
             raise LinkDown(self.name, str(request), "there is no connection")
         self._sent, self._heard, self._complaint = b"", b"", ""
+        me = asyncio.current_task()
+        assert me is not None
+        cancels = me.cancelling()
         try:
             async with asyncio.timeout(timeout_s) as self._deadline:
                 match request.function:
@@ -193,6 +196,8 @@ class ModbusWire:
             raise LinkDown(self.name, str(request), str(trouble), "device and network on?") from trouble
         finally:
             self._deadline = None
+        if me.cancelling() > cancels:  # lost in pymodbus, see `open`
+            raise asyncio.CancelledError
         return ModbusReply(exception=reply.exception_code) if reply.isError() else ModbusReply(tuple(reply.registers))
 
     async def drop(self) -> None:

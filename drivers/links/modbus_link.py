@@ -420,6 +420,8 @@ class ModbusLink:
 
     async def _once(self, request: Request, patience_s: float) -> ModbusReply:
         await self._ready(patience_s)
+        if self._abandoned:
+            raise asyncio.CancelledError
         self._on_wire = True
         try:
             answer = await self._line.ask(request)

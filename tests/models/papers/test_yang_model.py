@@ -113,7 +113,7 @@ def test_covariance_of_equation_9_is_the_scatter_of_repeats():
 
 def test_points_that_leave_a_parameter_open_are_refused():
     flat = np.stack([np.cos(np.arange(20.0)), np.sin(np.arange(20.0)), np.zeros(20)], axis=1) * 100
-    with pytest.raises(ValueError, match="plane"):
+    with pytest.raises(ValueError, match="at least one coordinate from the centre is zero"):
         fit_eq9(flat, np.zeros(3), np.zeros(20), 100.0)
     with pytest.raises(ValueError, match="six parameters"):
         fit_eq9(flat[:5], np.zeros(3), np.zeros(5), 100.0)
