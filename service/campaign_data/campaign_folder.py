@@ -114,6 +114,8 @@ def store_solution(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dic
 def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
     """Import a campaign folder unless its campaign is stored already, and return the ids of the complete runs by label.
 
+    Tables of the folder that the database lacks are added.
+
     Raises
     ------
     StoreError
@@ -127,6 +129,9 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
     ids = {r.label: r.id for r in store.runs.all(record.id) if r.visible_status == "complete"}
     if campaign.folder is not None:
         _check_same(store, campaign, store.machines.get(record.machine_id).doc, ids)
+        known = {table.crc for table in store.tables.all(record.machine_id)}
+        for crc in campaign.tables.keys() - known:
+            store.tables.add(record.machine_id, None, campaign.tables[crc], crc, {"kind": "imported"})
     return ids
 
 

@@ -51,7 +51,7 @@ NO_TABLE = CampaignTable()
 
 
 def campaign_table(store: Store | None, campaign: Campaign) -> CampaignTable:
-    """Return the table with which all identify runs of a campaign were measured, from the database or, without one, from its folder."""
+    """Return the table with which all identify runs of a campaign were measured, from its folder, else from the database."""
     stated = [r.table for r in campaign.runs if r.identifies]
     acted = [one for one in stated if one.acting_crc is not None]
     crc = acted[0].acting_crc if acted else None
@@ -59,7 +59,9 @@ def campaign_table(store: Store | None, campaign: Campaign) -> CampaignTable:
         return NO_TABLE
     if len(acted) < len(stated) or any(one.crc != crc for one in acted):
         return CampaignTable(None, f"the runs were measured with different compensation tables: {NOT_REMOVED}")
-    image = campaign.tables.get(crc) if store is None else images_of(store)(crc)
+    image = campaign.tables.get(crc)
+    if image is None and store is not None:
+        image = images_of(store)(crc)
     if image is None:
         where = "this folder" if store is None else "this database"
         sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted

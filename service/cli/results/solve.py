@@ -97,9 +97,9 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, out)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
-        known = remove_effects(None, found.without(without or []), campaign_table(None, found))
-        chosen = known.campaign
-        summary, doc = _solved(chosen, wanted)
+        chosen = found.without(without or [])
+        known = remove_effects(None, chosen, campaign_table(None, chosen))
+        summary, doc = _solved(known.campaign, wanted)
         doc |= known.doc
         if db is not None or machine is not None:
             with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: a refusal creates no database

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -164,6 +165,11 @@ def solved(capsys: pytest.CaptureFixture[str], *words: str) -> SolutionFile:
     return SolutionFile.model_validate_json(capsys.readouterr().out)
 
 
+def digests(report: Any) -> list[str]:
+    """SHA-256 of all data that a report names."""
+    return re.findall(r"\b[0-9a-f]{64}\b", json.dumps(report))
+
+
 def test_an_exported_folder_gives_the_same_answer_as_the_database(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], clean_environment: object
 ) -> None:
@@ -183,6 +189,14 @@ def test_an_exported_folder_gives_the_same_answer_as_the_database(
     assert read.table_removal is not None
     assert read.parameters == stored.parameters
     assert abbe.solve(abbe.read_campaign(tmp_path / "out"), model="rigid6").table.startswith(f"table {crc32(image):08X} was in force")
+    assert cli.run(["solve", "out", "--model", "rigid6", "--report", "report.json"]) == 0
+    assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6", "--report", "stored.json"]) == 0
+    reports = [json.loads((tmp_path / name).read_text()) for name in ("report.json", "stored.json")]
+    assert digests(reports[0]) == digests(reports[1])  # of the readings as measured
+    assert digests(reports[0])
+    assert cli.run(["solve", "out", "--model", "rigid6", "--db", "sqlite:///new.sqlite3"]) == 0
+    with Store.open("sqlite:///new.sqlite3") as store:
+        assert [table.crc for table in store.tables.all()] == [crc32(image)]
     (tmp_path / "out" / file).rename(tmp_path / file)
     without = solved(capsys, "out")
     assert without.table_removal is None
