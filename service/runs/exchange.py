@@ -187,7 +187,10 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
     for crc in _acting(written):
         if (image := images(crc)) is not None:
-            (folder / table_file(crc)).write_bytes(image)
+            with (folder / table_file(crc)).open("wb") as file:
+                file.write(image)
+                file.flush()
+                os.fsync(file.fileno())
     if record.doc.get("errors") is not None:
         _write_json(folder / record.doc["imported"]["current_model"]["errors"], record.doc["errors"])
 
