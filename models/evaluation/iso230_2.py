@@ -53,11 +53,14 @@ class ScaleBudget:
     """Standard uncertainties that the repeats do not show.
 
     ``per_length``: of the length scale, mm per mm (wavelength, expansion of the scales); ``reading_mm``: of the mean at each position,
-    independent from position to position (resolution, drift of the environment).
+    independent from position to position (resolution, drift of the environment); ``slope``: of a slope of all deviations, mm per mm, in
+    place of ``per_length`` where the temperature of the scale is known. ``per_length`` counts only between the two positions that decide a
+    figure, and is nothing where they coincide; for ``slope`` each figure is evaluated again with the deviations tilted.
     """
 
     per_length: float = 0.0
     reading_mm: float = 0.0
+    slope: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,11 +191,18 @@ def _of_s(side: _Side) -> F1:
 
 
 def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
-    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes and of the length scale between them."""
+    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes, of the length scale and of the slope."""
     hi, lo = int(np.argmax(upper)), int(np.argmin(lower))
-    scale = budget.per_length * float(abs(at[hi] - at[lo]))
+    scale = np.hypot(budget.per_length * abs(at[hi] - at[lo]), _tilt(at, upper, lower, budget))
     apart = float(np.hypot(u[hi], u[lo])) if hi != lo else 0.0
     return Value(float(upper[hi] - lower[lo]), float(np.hypot(apart, scale)))
+
+
+def _tilt(at: F1, upper: F1, lower: F1, budget: ScaleBudget) -> float:
+    """Return how much max(upper) - min(lower) changes at most if all deviations tilt by plus or minus the slope's uncertainty."""
+    along = budget.slope * (at - at.min())
+    plain = np.max(upper) - np.min(lower)
+    return max(float(abs(np.max(upper + t) - np.min(lower + t) - plain)) for t in (along, -along))
 
 
 def _accuracy(at: F1, sides: tuple[_Side, ...], u: F1, budget: ScaleBudget) -> Value:
@@ -200,7 +210,9 @@ def _accuracy(at: F1, sides: tuple[_Side, ...], u: F1, budget: ScaleBudget) -> V
     hi, lo = int(np.argmax(x + 2.0 * s)), int(np.argmin(x - 2.0 * s))
     value = _range(at, x + 2.0 * s, x - 2.0 * s, np.hypot(u, 2.0 * u_s), budget)
     # If one position decides both ends, its mean cancels and its scatter counts twice.
-    return value if hi != lo else Value(value.value_mm, float(4.0 * u_s[hi]))
+    if hi != lo:
+        return value
+    return Value(value.value_mm, float(np.hypot(4.0 * u_s[hi], _tilt(at, x + 2.0 * s, x - 2.0 * s, budget))))
 
 
 def _repeatability(side: _Side) -> Value:

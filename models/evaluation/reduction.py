@@ -6,7 +6,9 @@ Uncertainty as in ISO/TR 16015: temperature and coefficients are independent con
 
 Convention. Displacements and deviations grow with the axis coordinate; deviation = displacement read - displacement commanded. At t °C a
 scale of coefficient a moves the axis by (1 + a (t - 20)) for each commanded mm. A laser reads true length, so its coefficient is 0. If its
-own compensation of material expansion is on, it has already taken off b (t - 20) for each mm at the same temperature; b is its coefficient.
+own compensation of material expansion is on, it has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L what its own
+sensor of material temperature read. Scale at T, stated t = T + e and t_L = T + e_L: measured was a (T - 20) - b (T + e_L - 20), taken off
+is (a - b) (T + e - 20), and -(a - b) e - b e_L is left. The errors e and e_L are independent and have the same u(t).
 """
 
 from __future__ import annotations
@@ -60,14 +62,17 @@ class Expansion:
 
     @property
     def u_as_measured(self) -> float:
-        """Standard uncertainty of the deviation as measured at exactly ``temperature_c``, mm per mm: |scale - laser| u(t)."""
-        return abs(self.scale_per_k - self.laser_per_k) * self.u_temperature_k
+        """Standard uncertainty of the deviation as measured at exactly ``temperature_c``, mm per mm.
+
+        u² = ((scale - laser) u(t))² + (laser u(t))²: error of ``temperature_c``, and of what the laser's own sensor made it take off.
+        """
+        return float(np.hypot(self.scale_per_k - self.laser_per_k, self.laser_per_k)) * self.u_temperature_k
 
     @property
     def u_reduced(self) -> float:
         """Standard uncertainty of the reduction, mm per mm of travel (ISO/TR 16015, first order).
 
-        u² = ((scale - laser) u(t))² + ((t - 20) u(scale))². The laser's coefficient is a set number and adds nothing.
+        u² = ((scale - laser) u(t))² + (laser u(t))² + ((t - 20) u(scale))². The laser's coefficient is a set number and has no u.
         """
         return float(np.hypot(self.u_as_measured, self.rise_k * self.u_scale_per_k))
 

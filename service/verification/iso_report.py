@@ -102,7 +102,7 @@ def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduct
     runs = ", ".join(test.runs)
     if found.lowest != found.most:
         out.remarks.append(f"axis {test.name} ({runs}): positions have {found.lowest} to {found.most} approaches from one side")
-    out.remarks += [f"axis {test.name} ({runs}): {note}" for note in (*found.departures(), *test.notes)]
+    out.remarks += [f"axis {test.name} ({runs}): {note}" for note in (*found.departures(), *test.notes, *reduction.notes)]
     if found.R is None:
         out.not_observable.append(f"repeatability and accuracy of axis {test.name}: every position was approached once from each side")
 

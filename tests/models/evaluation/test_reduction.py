@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from abbe.models.evaluation.iso230_2 import Approaches, positioning
+from abbe.models.evaluation.iso230_2 import Approaches, ScaleBudget, positioning
 from abbe.models.evaluation.reduction import Expansion, reduced
 
 STEEL_AT_24 = Expansion(11.5e-6, 0.6e-6, 24.0, 0.2)
@@ -98,6 +98,74 @@ def test_uncertainty_by_hand():
     assert STEEL_AT_24.u_as_measured == pytest.approx(2.3e-6)
     assert STEEL_AT_24.u_reduced == pytest.approx(np.sqrt(11.05) * 1e-6)
     assert Expansion(11.5e-6, 0.6e-6, 20.0, 0.2).u_reduced == pytest.approx(2.3e-6)
+
+
+@pytest.mark.parametrize(
+    ("t", "laser", "as_measured", "reduced_um"),
+    [(20.0, 11.5e-6, 2.3, 2.3), (24.0, 11.5e-6, 2.3, np.hypot(2.3, 2.4)), (24.0, 3.5e-6, np.hypot(1.6, 0.7), np.sqrt(8.81))],
+    ids=["all taken off at 20 °C", "all taken off at 24 °C", "a part"],
+)
+def test_the_sensor_of_the_laser_has_an_error_of_its_own(t, laser, as_measured, reduced_um):
+    """Laser set to 3.5: (11.5 - 3.5) · 0.2 = 1.6, 3.5 · 0.2 = 0.7 and 4 · 0.6 = 2.4 µm/m: 2.56 + 0.49 + 5.76 = 8.81."""
+    one = Expansion(11.5e-6, 0.6e-6, t, 0.2, laser)
+    assert one.u_as_measured == pytest.approx(as_measured * 1e-6)
+    assert one.u_reduced == pytest.approx(reduced_um * 1e-6)
+
+
+@pytest.mark.parametrize("laser", [3.5e-6, 11.5e-6, 17e-6])
+@pytest.mark.parametrize("t", [20.0, 24.0])
+def test_the_stated_uncertainty_is_the_scatter_of_what_is_left_with_the_laser_compensating(t, laser):
+    """A perfect axis, read by a laser whose own sensor errs, reduced with a stated temperature and coefficient that err."""
+    rng, left, read = np.random.default_rng(5), [], []
+    for _ in range(4000):
+        scale, e, e_laser = 11.5e-6 + rng.normal() * 0.6e-6, rng.normal() * 0.2, rng.normal() * 0.2
+        measured = scale * (t - 20.0) - laser * (t + e_laser - 20.0)
+        left.append(measured - Expansion(11.5e-6, 0.6e-6, t + e, 0.2, laser).strain)
+        read.append(11.5e-6 * (t - 20.0) - laser * (t + e_laser - 20.0) - Expansion(11.5e-6, 0.6e-6, t + e, 0.2, laser).strain)
+    stated = Expansion(11.5e-6, 0.6e-6, t, 0.2, laser)
+    assert np.std(left) == pytest.approx(stated.u_reduced, rel=0.05)
+    assert np.std(read) == pytest.approx(stated.u_as_measured, rel=0.05)
+    assert abs(np.mean(left)) < 3.0 * stated.u_reduced / np.sqrt(4000.0)
+
+
+def five_cycles(slope: float, scatter_mm: float = 0.0) -> Approaches:
+    """Five cycles over 1 m of an axis whose only error is ``slope``; ``scatter_mm``: of the cycles at the middle."""
+    at = np.array([200.0, 450.0, 700.0, 950.0, 1200.0])
+    read = np.repeat((slope * at)[:, None], 5, axis=1)
+    read[2] += scatter_mm * np.array([-1.0, -0.5, 0.0, 0.5, 1.0])
+    return Approaches(at, read, read)
+
+
+def test_a_flat_steel_axis_is_not_known_better_than_its_slope():
+    """Reduced, all deviations are 0: a slope of u per length makes E, M and A u · 1 m = √11.05 µm, and no reversal."""
+    p = positioning(reduced(five_cycles(STEEL_AT_24.strain), STEEL_AT_24), ScaleBudget(slope=STEEL_AT_24.u_reduced))
+    for name in ("E", "E_forward", "E_backward", "M", "A", "A_forward", "A_backward"):
+        figure = getattr(p, name)
+        assert figure.value_mm == pytest.approx(0.0, abs=1e-12), name
+        assert figure.u_mm * 1e3 == pytest.approx(np.sqrt(11.05)), name
+    assert p.B.u_mm == p.R.u_mm == 0.0
+
+
+@pytest.mark.parametrize("true", [0.0, 2e-6, -46e-6])
+@pytest.mark.parametrize("scatter_mm", [0.0, 0.001, 0.02])
+def test_a_slope_error_of_the_stated_uncertainty_stays_inside_U(true, scatter_mm):
+    """Also where one position decides both ends of A, and where the slope turns over."""
+    u = STEEL_AT_24.u_reduced
+    truth = positioning(five_cycles(true, scatter_mm))
+    for wrong in np.linspace(-u, u, 9):
+        found = positioning(five_cycles(true + wrong, scatter_mm), ScaleBudget(slope=u))
+        for name in "EMA":
+            figure, real = getattr(found, name), getattr(truth, name)
+            assert abs(figure.value_mm - real.value_mm) <= 2.0 * figure.u_mm + 1e-12, (name, wrong)
+
+
+def test_without_a_slope_uncertainty_nothing_changes_and_between_far_extremes_both_ways_agree(shared):
+    test = axis_test(shared, "y")
+    assert positioning(test, ScaleBudget(1e-6, 1e-4)).A == positioning(test, ScaleBudget(1e-6, 1e-4, 0.0)).A
+    ramp = five_cycles(46e-6)
+    for name in "EMA":
+        ways = [getattr(positioning(ramp, b), name).u_mm for b in (ScaleBudget(per_length=3e-6), ScaleBudget(slope=3e-6))]
+        assert ways == pytest.approx([3e-3, 3e-3]), name
 
 
 def test_the_stated_uncertainty_is_the_scatter_of_wrong_temperatures_and_coefficients():

@@ -39,13 +39,15 @@ temperature_c = 24.0
 """
 
 
-def line(temperature_c: float | None = None, spread_k: float = 0.0) -> Run:
+def line(temperature_c: float | None = None, spread_k: float = 0.0, air_c: float | None = None, run_id: str = "r") -> Run:
     """A perfect steel axis of 1 m at 24 °C, five cycles, read by a laser without noise: 46 µm too long."""
     x = np.tile(np.concatenate([AT, AT[::-1]]), 5)
     columns = {"t_s": np.arange(50.0).tolist(), "x_mm": x.tolist(), "y_mm": [0.0] * 50, "z_mm": [0.0] * 50, "feed_mm_min": [60.0] * 50}
     columns |= {"direction": ([1] * 5 + [-1] * 5) * 5, "deviation_mm": (46e-6 * x).tolist()}
     if temperature_c is not None:
         columns["temp_x_C"] = (temperature_c + np.linspace(-0.5, 0.5, 50) * spread_k).tolist()
+    if air_c is not None:
+        columns["temp_air_C"] = [air_c] * 50
     setup = {
         "setup_id": "L",
         "t_set_s": 0.0,
@@ -55,7 +57,7 @@ def line(temperature_c: float | None = None, spread_k: float = 0.0) -> Run:
         "nominal_beam": [1.0, 0.0, 0.0],
     }
     machine = {"name": "m", "chain": "w-b-X-Y-Z-t", "vertical_axis": "Z", "stroke_mm": {"X": [0, 1000], "Y": [0, 1], "Z": [0, 1]}}
-    head = {"format": "abbe-run/1", "campaign": "c", "run_id": "r", "test": "laser_linear", "role": "identify"}
+    head = {"format": "abbe-run/1", "campaign": "c", "run_id": run_id, "test": "laser_linear", "role": "identify"}
     return run_of(head | {"machine": machine, "setup": setup, "columns": columns})
 
 
@@ -66,11 +68,13 @@ def figures(told: Evaluated, word: str, symbol: str = "E") -> list[tuple[float, 
 def test_both_values_and_both_uncertainties_in_micrometres() -> None:
     """By hand, 1 m: 11.5 · 4 = 46 µm. u as measured: 11.5 · 0.2 = 2.3 and wavelength 0.3; reduced: also 4 · 0.6 = 2.4.
 
-    The reduced deviations are all zero, so that their extremes lie at one place and show no uncertainty of length; A does likewise.
+    The reduced deviations are all zero. Their slope is as uncertain as it is for any other axis, and so are E and A.
     """
     told = evaluate([line()], None, {"X": STEEL})
     assert figures(told, "as measured at 24.00 ± 0.40 °C") == [(pytest.approx(46.0), pytest.approx(np.hypot(2.3, 0.3)))]
-    assert [v for v, _ in figures(told, "at 20 °C, ISO 230-2")] == [pytest.approx(0.0, abs=1e-9)]
+    for symbol in ("E", "E+", "M", "A"):
+        wanted = (pytest.approx(0.0, abs=1e-9), pytest.approx(np.sqrt(2.3**2 + 2.4**2 + 0.3**2)))
+        assert figures(told, "at 20 °C, ISO 230-2", symbol) == [wanted], symbol
     twice = evaluate([line()], None, {"X": AxisMaterial(23e-6, 0.6e-6, 24.0, 0.1, 0.0)})
     assert figures(twice, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.sqrt(2.3**2 + 2.4**2 + 0.3**2)))]
     assert REDUCTION_STATEMENT in told.statements
@@ -85,10 +89,35 @@ def test_the_sensor_of_the_axis_counts_before_the_stated_temperature() -> None:
 
 
 def test_what_the_laser_took_off_is_not_taken_off_twice() -> None:
-    """Laser's compensation set to the scale's coefficient: what it shows is already at 20 °C, and only the coefficient stays uncertain."""
+    """Laser's compensation set to the scale's coefficient: what it shows is already at 20 °C, as well as its own sensor knew it: 2.3."""
     told = evaluate([line()], None, {"X": AxisMaterial(11.5e-6, 0.6e-6, 24.0, 0.2, 11.5e-6)})
-    assert figures(told, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.hypot(2.4, 0.3)))]
-    assert figures(told, "as measured") == [(pytest.approx(46.0), pytest.approx(0.3))]
+    assert figures(told, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.sqrt(2.3**2 + 2.4**2 + 0.3**2)))]
+    assert figures(told, "as measured") == [(pytest.approx(46.0), pytest.approx(np.hypot(2.3, 0.3)))]
+
+
+@pytest.mark.parametrize("read_c", [75.2, -40.0, 273.15 + 24.0], ids=["Fahrenheit", "broken wire", "kelvin"])
+def test_a_sensor_out_of_bounds_is_not_used_and_the_report_says_so(read_c) -> None:
+    told = evaluate([line(read_c)], None, {"X": STEEL})
+    assert {f.group for f in told.figures} == {"Axis X, set-up L: positioning, ISO 230-2"}
+    why = f"temp_x_C of run r has {read_c:g}, outside of -20 to 50 °C"
+    assert any(f"not reduced to 20 °C: {why}" in remark for remark in told.remarks)
+    assert holds_at([line(read_c)], {"X": STEEL}) == f"X unknown ({why})"
+
+
+@pytest.mark.parametrize(("air_c", "said"), [(21.9, True), (22.1, False), (25.9, False), (26.1, True), (None, False)])
+def test_air_far_from_the_stated_temperature_is_remarked(air_c, said) -> None:
+    told = evaluate([line(air_c=air_c)], None, {"X": STEEL})
+    assert any(f"air on record was at {air_c or 0:.2f} °C, the scale is stated at 24.00 °C" in r for r in told.remarks) is said
+    assert figures(told, "at 20 °C, ISO 230-2")
+    assert not any("air on record" in r for r in evaluate([line(24.0, air_c=air_c)], None, {"X": STEEL}).remarks)
+
+
+def test_a_sensor_in_some_runs_only_is_remarked() -> None:
+    told = evaluate([line(23.0), line(run_id="s")], None, {"X": STEEL})
+    assert "stated in the machine file" in told.conditions[f"{AT_20}, axis X L"]
+    assert any("only 1 of 2 runs recorded temp_x_C; the stated temperature is used" in r for r in told.remarks)
+    without = evaluate([line(23.0), line(run_id="s")])
+    assert any("only 1 of 2 runs recorded temp_x_C; it is not used" in r for r in without.remarks)
 
 
 @pytest.mark.parametrize(
