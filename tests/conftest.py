@@ -31,15 +31,26 @@ settings.load_profile("fixed")  # a test that fails must fail again: hypothesis 
 ROOT = Path(__file__).resolve().parents[1]
 RUN_MARK = f"ABBE_TEST_RUN={os.getpid()}"
 MEMORY, ROOM_BYTES = Path("/dev/shm"), 4 * 2**30
+FREE_BYTES = 6 * 2**30
+"""Memory that must be available, too: the size of a file system in memory promises none, and the tests need some beside it."""
 Require = Callable[[str, bool, str], None]
 POSTGRES = "postgresql://postgres@127.0.0.1:5432/"
 
 
+def _available_bytes() -> int:
+    """Return the memory that programs can still get, 0 where the system does not say so."""
+    try:
+        told = Path("/proc/meminfo").read_text()
+    except OSError:
+        return 0
+    return next((int(line.split()[1]) * 1024 for line in told.splitlines() if line.startswith("MemAvailable:")), 0)
+
+
 def _runs_from(folder: Path) -> bool:
-    """Whether a file system in memory has room for what tests write, and starts programs."""
+    """Whether a file system in memory has room for what tests write, the computer has the memory for it, and programs start from it."""
     if not os.access(folder, os.W_OK | os.X_OK) or os.statvfs(folder).f_flag & os.ST_NOEXEC:
         return False
-    return shutil.disk_usage(folder).free >= ROOM_BYTES
+    return shutil.disk_usage(folder).free >= ROOM_BYTES and _available_bytes() >= FREE_BYTES
 
 
 if "PYTEST_DEBUG_TEMPROOT" not in os.environ and _runs_from(MEMORY):

@@ -212,7 +212,7 @@ def test_once_checks_tells_raises_the_alarm_ends_with_1_and_says_what_a_bad_camp
     broker, heard = receiver
     timetable = '[[schedule]]\nname = "weekly"\ncron = "0 6 * * 1"\nrecipe = "quick-check at 20 Hz"\non_alarm = "propose"\n'
     out = f'[verify]\nhelix_rms_um = 1\n[mqtt]\nurl = "{broker.url}"\ntopic_prefix = "plant/abbe"\n[web]\nport = 0\n{timetable}'
-    sims = start_sims("--speed", "200", "--seed", "2", extra=out)
+    sims = start_sims("--speed", "100", "--seed", "2", extra=out)
     assert run(["serve", str(sims.machine_file), "--once"]) == 1, capsys.readouterr().err
     capsys.readouterr()
     result = payload(heard.expect("sim/verification"))

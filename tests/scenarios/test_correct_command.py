@@ -30,7 +30,7 @@ def identified(tmp_path_factory):
     """A simulated machine and the campaigns `june` (identification) and `start` (verification), measured once for all tests."""
     folder = tmp_path_factory.mktemp("identified")
     copy_identified(tmp_path_factory, folder)
-    with simulated(folder, *MACHINE, "--speed", "150") as sims:
+    with simulated(folder, *MACHINE, "--speed", "60") as sims:
         yield sims
 
 

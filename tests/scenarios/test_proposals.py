@@ -72,7 +72,7 @@ class Shop:
 def shop(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("proposals")
     copy_identified(tmp_path_factory, folder)
-    with simulated(folder, *MACHINE, "--speed", "150", extra=TWO) as sims:
+    with simulated(folder, *MACHINE, "--speed", "80", extra=TWO) as sims:
         loaded = load_machine(sims.machine_file)
         site = site_of(loaded.machine)
         before = controller_words(sims)

@@ -182,7 +182,7 @@ async def test_a_link_lost_right_after_activation_is_asked_again_or_taken_back_l
 
 async def test_every_entry_acts_on_its_own_axis_with_its_own_sign(start_sims, tmp_path):
     """Each slope in turn is measured by the laser along the axis it moves: the tool goes where the table says, nowhere else."""
-    sims = start_sims("--speed", "150", "--seed", "5")
+    sims = start_sims("--speed", "100", "--seed", "5")
     async with bench(sims, tmp_path) as (site, store, session):
         plan = [Diagonal(d, f"V{d}", "holdout", d, 2, "").plan(site.machine) for d in ("ppp", "npp", "pnp", "ppn")]
 

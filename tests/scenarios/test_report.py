@@ -133,7 +133,7 @@ def verified(folder: Path) -> None:
 def stored(tmp_path_factory) -> Iterator[Path]:
     """A folder with a machine file and a database: two measured campaigns, solution, discovery, push, verification."""
     folder = tmp_path_factory.mktemp("report")
-    with simulated(folder, "--speed", "200", "--seed", "5") as sims, pytest.MonkeyPatch.context() as patch:
+    with simulated(folder, "--speed", "100", "--seed", "5") as sims, pytest.MonkeyPatch.context() as patch:
         patch.chdir(folder)
         (folder / "axis.toml").write_text(AXIS)
         (folder / "small.toml").write_text(SMALL)

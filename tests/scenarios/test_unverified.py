@@ -24,7 +24,7 @@ def fleet(url, capsys):
 
 
 def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(start_sims, tmp_path, capsys):
-    sims = start_sims("--speed", "150")
+    sims = start_sims("--speed", "40")
     url, file = f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}", str(sims.machine_file)
 
     async def kept():
@@ -62,7 +62,7 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
 
 
 def test_the_check_of_an_accepted_table_is_its_check_and_an_ended_certificate_marks_it(start_sims, tmp_path, capsys):
-    sims = start_sims("--speed", "150")
+    sims = start_sims("--speed", "100")
     folder = sims.machine_file.parent
     url, file = f"sqlite:///{folder / 'abbe.sqlite3'}", str(sims.machine_file)
     (tmp_path / "another").mkdir()

@@ -43,7 +43,7 @@ class AtTheConsole:
 @pytest.fixture
 def stopped(start_sims, tmp_path) -> Iterator[tuple[AtTheConsole, Sims]]:
     """A commissioning that an e-stop has ended while a test table is active: the command waits."""
-    sims = start_sims("--speed", "120")
+    sims = start_sims("--speed", "60")
     command = AtTheConsole(tmp_path, "comp", "commission", str(sims.machine_file))
     try:
         wait_for(lambda: last_state(tmp_path) == "PROBATION", 90, "a test table in force")

@@ -70,6 +70,30 @@ def test_a_broker_that_dies_twice_and_a_service_that_ends_between_lose_nothing_a
     assert received(receiver) == kept
 
 
+def test_a_service_that_starts_without_its_broker_works_and_its_messages_wait_until_the_broker_is_there(
+    tmp_path: Path, ending: ExitStack
+) -> None:
+    broker = Broker(tmp_path)
+    ending.callback(lambda: broker.process.close())
+    receiver = ending.enter_context(closing(broker.subscriber()))
+    broker.process.kill()
+    running = ending.enter_context(closing(service(tmp_path, schedules=[EVERY_SECOND], mqtt=broker.url, port=free_port())))
+    running.expect("broker not reachable")
+    for _ in range(2):
+        running.expect('"check done"')
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        assert store.outbox.count() >= 2
+
+    broker.start()
+    assert payload(receiver.expect('"state":"online"'))["machine"] == "mill-7"
+    while len(received(receiver)) < 2:
+        receiver.expect("mill-7/verification")
+    assert received(receiver)[:2] == [1, 2]
+    code, took_s = running.terminate()
+    assert (code, took_s < 5.0) == (0, True)
+    assert not any("Traceback" in line for line in running.lines)
+
+
 @pytest.mark.parametrize("lost", [False, True] if os.environ.get("ABBE_TEST_LONG") else [True])
 def test_a_defect_ends_the_service_with_a_traceback_and_a_farewell(tmp_path: Path, ending: ExitStack, lost: bool) -> None:
     """systemd starts it again; the slot is claimed, so that the defect is not met a second time at once.

@@ -261,8 +261,8 @@ def test_a_core_that_stands_still_is_told_and_the_page_still_knows_the_past_and_
     assert made.http.get("/readyz").status_code == 200
 
 
-def test_a_job_is_started_once_steered_and_refused_and_the_page_ends_when_the_core_is_killed(made: Running, shared_folder: Path) -> None:
-    """Last in this file: it kills the service that the tests before it share."""
+def test_a_job_is_started_once_steered_and_refused_and_the_service_ends_soon(made: Running, shared_folder: Path) -> None:
+    """Last of those that share a service: it ends the one whose core has stood still before."""
     first = made.start("endless", **{"Idempotency-Key": "k1"})
     number = first.json()["id"]
     again = made.start("endless", **{"Idempotency-Key": "k1"})
@@ -288,5 +288,14 @@ def test_a_job_is_started_once_steered_and_refused_and_the_page_ends_when_the_co
         People(store, SystemClock()).disable("a-operator")
     assert made.start("quick").status_code == 401
     page = made.web
-    made.process.kill()
-    assert ended(page, 10.0)
+    code, took_s = made.process.terminate()
+    assert (code, took_s < 5.0) == (0, True)
+    assert ended(page, 1.0)
+    assert not any("Traceback" in line for line in made.process.lines)
+
+
+def test_the_page_ends_when_the_core_is_killed(tmp_path: Path) -> None:
+    with bench(tmp_path, YEARLY) as made:
+        page = made.web
+        made.process.kill()
+        assert ended(page, 10.0)
