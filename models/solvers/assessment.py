@@ -14,6 +14,7 @@ import scipy
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.geometry.volume import unit_deviation, volume_frame, volume_grid
 from abbe.models.machine import Machine
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.cures import CampaignLayout
@@ -38,7 +39,7 @@ from abbe.models.solvers.observability.rank import (
 from abbe.models.solvers.observability.volume import Knowing, Number, Plane, Volume, observability_number, plane_at, volume_at, whole_volume
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import setup_unknowns
-from abbe.models.solvers.priors import Priors, size_model
+from abbe.models.solvers.priors import Priors, size_model, term_prior_sd
 
 __all__ = ["Observability", "motions_of", "observability", "observability_of"]
 
@@ -173,6 +174,39 @@ def observability_of(solution: JointSolution, known: Knowledge | None = None) ->
     beliefs = _Beliefs(e.theta, e.covariance, s.prior_root, s.information, float(np.sqrt(np.mean(noise**2))))
     columns = campaign_columns(s.machine, s.terms, s.data, s.setup)
     return _report(_Model(s.machine, s.terms, s.order), s.data, columns, beliefs, known)
+
+
+LARGEST_MAP = 3.0
+"""Largest rms of a predicted map, as a multiple of that of a usual machine."""
+MAP_NODES = 5
+
+
+@dataclass(frozen=True)
+class MapAgainstPrior:
+    """Rms length over the volume of a solution's map, of its standard uncertainty, and of a usual machine's errors by the priors, mm."""
+
+    predicted_mm: float
+    u_mm: float
+    prior_mm: float
+
+    @property
+    def carried(self) -> bool:
+        """Whether the readings carry the map: no reading makes a machine less known than the priors do."""
+        return self.u_mm <= self.prior_mm and self.predicted_mm <= LARGEST_MAP * self.prior_mm
+
+
+def map_against_prior(solution: JointSolution) -> MapAgainstPrior:
+    """Compare a solution's map, best-fit rigid motion removed, with the documented priors on an even grid over the strokes."""
+    machine, terms = solution.machine, solution.terms
+    grid = volume_grid(machine.stroke_mm, MAP_NODES)
+    unit = unit_deviation(machine, terms, grid, None, volume_frame(machine, MAP_NODES))
+    sd = term_prior_sd(machine, terms, Priors())
+    u2 = np.einsum("mcp,pq,mcq->m", unit, solution.term_covariance, unit, optimize=True)
+    return MapAgainstPrior(
+        float(np.sqrt(np.mean(np.sum((unit @ solution.coefficients) ** 2, axis=1)))),
+        float(np.sqrt(np.maximum(u2, 0.0).mean())),
+        float(np.sqrt(np.mean(np.sum((unit * sd) ** 2, axis=(1, 2))))),
+    )
 
 
 def motions_of(solution: JointSolution) -> tuple[MotionStatus, ...]:

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.paths import DIAGONALS, step_diagonal
+from abbe.models.solvers.assessment import map_against_prior
 from abbe.models.solvers.helix import HelixSolution, fit_run
 from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
 from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
@@ -75,7 +76,7 @@ class Solved:
 def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
     """Solve runs of the role ``identify`` together, after checking each for consistency.
 
-    ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it.
+    ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it or cannot carry it (`map_against_prior`).
 
     Raises
     ------
@@ -91,12 +92,16 @@ def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", 
     if not used:
         raise NotObservable("no run of this campaign has the role identify", "measure an identification campaign first")
     progress(f"{len(used)} runs: units, axes, copies, machine")
+    free = model is None
     model, smaller = (model, []) if model is not None else _affordable([run_data(r, blocks=ALL_READINGS) for r in used])
     flags = smaller + check_campaign(site, used, [r for r in runs if r.role == "holdout"], model)
     bars = [r for r in used if r.is_bar]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
     joint = solve_joint(site.machine, data, model=model, progress=progress)
+    if beyond := _beyond_the_prior(joint, solved_smaller=free):
+        flags += beyond
+        joint = solve_joint(site.machine, data, model="rigid6", progress=progress) if free else joint
     flags += check_instruments(joint, data)
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
@@ -176,6 +181,24 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
         return "rigid21", []
     what = f"{count} readings in all are too few for rigid21 ({wanted} are needed): solved for rigid6, scales and squareness only"
     return "rigid6", [CampaignIssue(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
+
+
+def _beyond_the_prior(joint: JointSolution, *, solved_smaller: bool) -> list[CampaignIssue]:
+    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs cannot carry them."""
+    if joint.model == "rigid6":
+        return []
+    found = map_against_prior(joint)
+    if found.carried:
+        return []
+    worst = max(joint.runs, key=lambda run: run.rms_mm / run.expected_mm)
+    what = (
+        f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, a usual machine's are "
+        f"{found.prior_mm * 1e3:.0f} µm: no smooth motions follow these readings"
+    )
+    instead = "; solved for rigid6, scales and squareness only" if solved_smaller else ""
+    return [
+        CampaignIssue(worst.label, what + instead, "look for the pitch of a screw or a kink of a rail with axis runs in fine steps", False)
+    ]
 
 
 def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[CampaignIssue]:
