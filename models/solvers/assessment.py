@@ -41,7 +41,7 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import Priors, size_model, term_prior_sd
 
-__all__ = ["Observability", "motions_of", "observability", "observability_of"]
+__all__ = ["MapAgainstPrior", "Observability", "map_against_prior", "motions_of", "observability", "observability_of"]
 
 SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
 FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}

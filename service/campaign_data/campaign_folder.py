@@ -129,9 +129,7 @@ def ensure_stored(store: Store, campaign: Campaign) -> dict[str, int]:
     ids = {r.label: r.id for r in store.runs.all(record.id) if r.visible_status == "complete"}
     if campaign.folder is not None:
         _check_same(store, campaign, store.machines.get(record.machine_id).doc, ids)
-        known = {table.crc for table in store.tables.all(record.machine_id)}
-        for crc in campaign.tables.keys() - known:
-            store.tables.add(record.machine_id, None, campaign.tables[crc], crc, {"kind": "imported"})
+        store.tables.add_missing(record.machine_id, campaign.tables)
     return ids
 
 

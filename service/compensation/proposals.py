@@ -30,7 +30,7 @@ from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
-from abbe.service.identification.solve import Solved, solve_runs
+from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.identification.table_removal import CampaignTable
 from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest, reasons_against
@@ -242,8 +242,16 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
 
 
 def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
-    """Solve runs that were measured while ``base`` was active, and add their correction to it. ``lsb_nm``: the controller's unit, nm."""
+    """Solve runs that were measured while ``base`` was active, and add their correction to it. ``lsb_nm``: the controller's unit, nm.
+
+    Raises
+    ------
+    TableRefused
+        The readings cannot carry the map.
+    """
     solved = solve_runs(site, runs)
+    if beyond := beyond_the_prior(solved.joint):
+        raise TableRefused(f"no tables from a map that the readings cannot carry: {beyond.what}", f"{beyond.remedy}; nothing was written")
     change = nine_tables(solved.joint, GRID)
     predicted = predict_residual(solved.joint, change)
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted)

@@ -99,8 +99,8 @@ def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", 
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
     joint = solve_joint(site.machine, data, model=model, progress=progress)
-    if beyond := _beyond_the_prior(joint, solved_smaller=free):
-        flags += beyond
+    if beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else ""):
+        flags.append(beyond)
         joint = solve_joint(site.machine, data, model="rigid6", progress=progress) if free else joint
     flags += check_instruments(joint, data)
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
@@ -183,22 +183,20 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
     return "rigid6", [CampaignIssue(min(data, key=lambda r: r.deviation_mm.size).label, what, "measure more positions", False)]
 
 
-def _beyond_the_prior(joint: JointSolution, *, solved_smaller: bool) -> list[CampaignIssue]:
-    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs cannot carry them."""
-    if joint.model == "rigid6":
-        return []
-    found = map_against_prior(joint)
-    if found.carried:
-        return []
+def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssue | None:
+    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs cannot carry them.
+
+    ``instead``: what is done about it, added to the text.
+    """
+    found = None if joint.model == "rigid6" else map_against_prior(joint)
+    if found is None or found.carried:
+        return None
     worst = max(joint.runs, key=lambda run: run.rms_mm / run.expected_mm)
     what = (
         f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, a usual machine's are "
-        f"{found.prior_mm * 1e3:.0f} µm: no smooth motions follow these readings"
+        f"{found.prior_mm * 1e3:.0f} µm: no smooth motions follow these readings{instead}"
     )
-    instead = "; solved for rigid6, scales and squareness only" if solved_smaller else ""
-    return [
-        CampaignIssue(worst.label, what + instead, "look for the pitch of a screw or a kink of a rail with axis runs in fine steps", False)
-    ]
+    return CampaignIssue(worst.label, what, "look for the pitch of a screw or a kink of a rail: measure the axes in fine steps", False)
 
 
 def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[CampaignIssue]:

@@ -30,7 +30,8 @@ from abbe.service.domain.measured import (
 )
 from abbe.service.errors import CaptureConflict, NotStored, StoreError
 from abbe.service.storage.database import CAMPAIGN, CHECKPOINT, CHUNK, MACHINE, RUN, Repository, if_given, insert_row, owner_of
-from abbe.service.storage.tables import campaigns, checkpoints, chunks, comp_tables, heartbeats, machines, runs
+from abbe.service.storage.repositories.results import insert_missing_tables
+from abbe.service.storage.tables import campaigns, checkpoints, chunks, heartbeats, machines, runs
 
 MOST_DIGITS = 10
 """A text with this many digits or more is not a row id."""
@@ -180,11 +181,7 @@ class Runs(Repository):
             campaign_id = insert_campaign(connection, machine_id, *campaign, now)
             for run in imported:
                 _insert_imported(connection, campaign_id, run, now)
-            known = set(connection.scalars(select(comp_tables.c.crc).where(comp_tables.c.machine_id == machine_id)))
-            for crc, image in tables.items():
-                if crc not in known:
-                    row = {"machine_id": machine_id, "image": image, "crc": crc, "doc": {"kind": "imported"}, "created_utc": now}
-                    connection.execute(comp_tables.insert().values(row))
+            insert_missing_tables(connection, machine_id, tables, now)
             return campaign_id
 
         return self._db.commit(work)

@@ -6,7 +6,7 @@ A push journal is one append-only chain for each control, named after the machin
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -79,6 +79,14 @@ class Solutions(Repository):
         return self._all(SOLUTION, solutions.c.kind == kind, newest=True, limit=limit)
 
 
+def insert_missing_tables(connection: Connection, machine_id: int, images: Mapping[int, bytes], now: str) -> None:
+    """Store tables that came with runs measured elsewhere, by CRC, unless the machine has them already."""
+    known = set(connection.scalars(select(comp_tables.c.crc).where(comp_tables.c.machine_id == machine_id)))
+    for crc in images.keys() - known:
+        row = {"machine_id": machine_id, "image": images[crc], "crc": crc, "doc": {"kind": "imported"}, "created_utc": now}
+        connection.execute(comp_tables.insert().values(row))
+
+
 class Tables(Repository):
     """Compensation tables."""
 
@@ -89,6 +97,10 @@ class Tables(Repository):
         """
         values = {"machine_id": machine_id, "solution_id": solution_id, "image": image, "crc": crc, "doc": doc}
         return self._add(comp_tables, **values, created_utc=self._db.now())
+
+    def add_missing(self, machine_id: int, images: Mapping[int, bytes]) -> None:
+        """Store imported tables, by CRC, unless the machine has them already."""
+        self._db.commit(lambda connection: insert_missing_tables(connection, machine_id, images, self._db.now()))
 
     def get(self, table_id: int) -> TableRecord:
         """Read one table. Raises NotStored."""

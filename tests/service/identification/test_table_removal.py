@@ -112,15 +112,21 @@ def kinked() -> NineTables:
     return NineTables(at, (values[0], values[1], values[2]), (none[0], none[1], none[2]))
 
 
+def measured_with(image: bytes, folder: Path) -> Path:
+    """The campaign `july`, whose runs state this table as acting."""
+    write_case(folder, campaign="july")
+    for path in folder.glob("r*.json"):
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"table": {"crc": crc32(image), "acting": True}}))
+    return folder
+
+
 def test_every_command_takes_the_table_out_that_the_database_knows(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], clean_environment: object
 ) -> None:
     """Solved or searched, by a command or by the service: one and the same readings, else one machine would get two models."""
     monkeypatch.chdir(tmp_path)
     image = encode(table_image(kinked(), 100, 7))
-    folder = write_case(tmp_path / "files", campaign="july")
-    for path in folder.glob("r*.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"table": {"crc": crc32(image), "acting": True}}))
+    folder = measured_with(image, tmp_path / "files")
     assert cli.run(["import", str(folder), "--db", DB]) == 0
     with Store.open(DB) as store:
         before = from_store(store, "july")
@@ -176,9 +182,7 @@ def test_an_exported_folder_gives_the_same_answer_as_the_database(
     """It holds the table that was in force; without that file the answer says so, and a damaged file is refused."""
     monkeypatch.chdir(tmp_path)
     image = encode(table_image(kinked(), 100, 7))
-    folder = write_case(tmp_path / "files", campaign="july")
-    for path in folder.glob("r*.json"):
-        path.write_text(json.dumps(json.loads(path.read_text()) | {"table": {"crc": crc32(image), "acting": True}}))
+    folder = measured_with(image, tmp_path / "files")
     file = f"table-{crc32(image):08X}.bin"
     (folder / file).write_bytes(image)
     assert cli.run(["import", str(folder), "--db", DB]) == 0
