@@ -6,17 +6,17 @@ the old correction and make the machine worse. `abbe correct` adds the old and t
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.solution_file import TableInForce
 from abbe.service.errors import FormatRefused
+from abbe.service.runs.exchange import Images
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Where an image holds the kind of its table (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
-Images = Callable[[int], bytes | None]
 REMEDY = "measure again without a table in force; or, if the control has Abbe's register map, add the tables with `abbe correct`"
 CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
 
@@ -49,11 +49,6 @@ def images_of(store: Store) -> Images:
     for name in {store.machines.get(t.machine_id).name for t in store.tables.all()}:
         found |= {push.base_crc: push.base_image for push in JournalView.read(store, name, origins=False).bases() if push.base_image}
     return found.get
-
-
-def no_images(crc: int) -> bytes | None:
-    """Look-up for a solution without a database: finds nothing."""
-    return None
 
 
 def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: bool = False) -> bool:

@@ -172,10 +172,11 @@ def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, An
 def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
     """Return whether a solution's runs are known to be measured without a correction; refuse a solution measured with one."""
     from abbe.service.compensation.comp_export import solution_document
-    from abbe.service.tables.measured_with import check_fresh, images_of, no_images, stored_tables, tables_of
+    from abbe.service.runs.exchange import no_image
+    from abbe.service.tables.measured_with import check_fresh, images_of, stored_tables, tables_of
 
     if not source.isdigit():
-        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_images, confirmed_none=confirmed_none)
+        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_image, confirmed_none=confirmed_none)
     with open_store(database_url(db, machine)) as store:
         return check_fresh(stored_tables(store, int(source)), images_of(store), confirmed_none=confirmed_none)
 
