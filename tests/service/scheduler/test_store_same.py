@@ -133,6 +133,8 @@ def found(ask: Any) -> None:
         ask.tables.get(77),
         ask.tables.all(),
         ask.tables.all(2),
+        ask.tables.add_missing(1, {5: BYTES, 0: b"known already"}),
+        ask.tables.all(1),
     )
     entry = PushEntry(machine="mill-7", push=1, seq=0, state=PushState.SNAPSHOT, doc=DOC, utc="then", prev="", digest="1" * 64)
     ask.pushes.append(entry), ask.pushes.append(entry), ask.pushes.append(replace(entry, seq=1, prev="1" * 64, digest="2" * 64))
