@@ -225,7 +225,7 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     """
     database = sqlite_file(source.url, "backup")
     if not database.is_file():
-        raise BackupRefused(f"there is no database {database}", "give a machine file or --store URL")
+        raise BackupRefused(f"there is no database {database}", "give -m FILE or --db URL")
     part = _new_folder(target)
     try:
         made = _fill(part, database, source, utcnow, with_key=with_key)

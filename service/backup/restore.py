@@ -98,7 +98,7 @@ def restore(
 def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Targets:
     """Return the target paths, or refuse if they exist or are in use."""
     if not database.parent.is_dir():
-        raise BackupRefused(f"folder {database.parent} does not exist", "create it, or give another --store")
+        raise BackupRefused(f"folder {database.parent} does not exist", "create it, or give another --db")
     if users := processes_using(database):
         raise BackupRefused(f"{database} is in use by process {users[0]}", "stop the service first: systemctl stop abbe")
     if database.exists() and is_locked(database):
@@ -106,7 +106,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
     targets = _Targets(database, segment_folder(into.url, into.capture), *files_of(sqlite_base(database)))
     existing = targets.existing()
     if existing and not replace:
-        raise BackupRefused(f"{existing[0]} exists", "give --replace to put what is there aside, or another --store")
+        raise BackupRefused(f"{existing[0]} exists", "give --replace to put what is there aside, or another --db")
     return targets
 
 

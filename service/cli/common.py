@@ -1,4 +1,4 @@
-"""Shared by commands: the database option, and output for people and for programs."""
+"""Shared by commands: how machine and database are named, and output for people and for programs."""
 
 from __future__ import annotations
 
@@ -18,21 +18,57 @@ if TYPE_CHECKING:
     from abbe.service.queries.reader import Reader
     from abbe.service.storage.store import Store
 
-ENVIRONMENT = "ABBE_DB"
-DEFAULT = "sqlite:///abbe.sqlite3"
+ENVIRONMENT, MACHINE_ENVIRONMENT = "ABBE_DB", "ABBE_MACHINE"
+DEFAULT, DEFAULT_MACHINE = "sqlite:///abbe.sqlite3", "abbe.toml"
 
 DbOption = Annotated[
     str | None,
-    typer.Option("--db", metavar="URL", help=f"Database. Default: {ENVIRONMENT} of the environment, else {DEFAULT}.", show_default=False),
+    typer.Option(
+        "--db",
+        metavar="URL",
+        help=f"Database, instead of the machine file's. Without a machine: {ENVIRONMENT}, else {DEFAULT}.",
+        show_default=False,
+    ),
 ]
 MachineOption = Annotated[
-    Path | None, typer.Option("--machine", metavar="FILE", help="Use the database of this machine file.", show_default=False)
+    Path | None,
+    typer.Option(
+        "-m",
+        "--machine",
+        metavar="FILE",
+        help=f"Machine file. Default: {MACHINE_ENVIRONMENT}, else {DEFAULT_MACHINE} in this folder.",
+        show_default=False,
+    ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
 
 
+def named_machine(given: Path | None) -> Path | None:
+    """Return the machine file of a command: of ``-m``, else of ``ABBE_MACHINE``, else ``abbe.toml`` in this folder, else None."""
+    if given is not None:
+        return given
+    if named := os.environ.get(MACHINE_ENVIRONMENT):
+        return Path(named)
+    return Path(DEFAULT_MACHINE) if Path(DEFAULT_MACHINE).is_file() else None
+
+
+def machine_file(given: Path | None) -> Path:
+    """Return the machine file of a command that needs one.
+
+    Raises
+    ------
+    ConfigError
+        None is named (`named_machine`).
+    """
+    from abbe.service.errors import ConfigError
+
+    if (found := named_machine(given)) is None:
+        raise ConfigError("no machine is named", f"give -m FILE, set {MACHINE_ENVIRONMENT}, or go to the folder of {DEFAULT_MACHINE}")
+    return found
+
+
 def database_url(db: str | None, machine: Path | None = None) -> str:
-    """Return the database of a command: ``--db`` or the machine file's, else the environment's, else the default.
+    """Return the database of a command: ``--db``, else that of the named machine file, else the environment's, else the default.
 
     Raises
     ------
@@ -42,12 +78,14 @@ def database_url(db: str | None, machine: Path | None = None) -> str:
     from abbe.service.errors import ConfigError
 
     if db is not None and machine is not None:
-        raise ConfigError("--db and --machine both name a database", "give one of them")
-    if machine is not None:
+        raise ConfigError("--db and -m both name a database", "give one of them")
+    if db is not None:
+        return db
+    if (found := named_machine(machine)) is not None:
         from abbe.service.config import load_machine
 
-        return load_machine(machine).database_url
-    return db or os.environ.get(ENVIRONMENT) or DEFAULT
+        return load_machine(found).database_url
+    return os.environ.get(ENVIRONMENT) or DEFAULT
 
 
 def open_store(url: str, *, must_exist: bool = True) -> Store:
@@ -72,17 +110,17 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
         and parsed.database != ":memory:"
         and not Path(parsed.database).exists()
     ):
-        raise StoreError(f"there is no database {parsed.database}", f"give --db URL, --machine FILE or set {ENVIRONMENT}")
+        raise StoreError(f"there is no database {parsed.database}", "give -m FILE or --db URL")
     return Store.open(url)
 
 
 @contextmanager
-def reader_of(machine: Path) -> Iterator[Reader]:
+def reader_of(machine: Path | None) -> Iterator[Reader]:
     """Yield the read model of a machine file: its database and its control. A missing database is an error and is not created."""
     from abbe.service.config import load_machine
     from abbe.service.domain.machine import control_of
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     with open_store(loaded.database_url) as store:
         yield reader(store, loaded.machine.name, control_of(loaded.machine.devices.cnc))
 

@@ -14,6 +14,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from abbe.service.cli.common import MachineOption, machine_file
+
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
@@ -29,7 +31,6 @@ if TYPE_CHECKING:
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
 
-MachineArgument = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
 AcceptTable = Annotated[
     bool,
     typer.Option("--accept-table", help="I have looked: the table in force, which this database did not push, is right."),
@@ -38,7 +39,6 @@ RECIPES = "identification, verification, quick-check"
 
 
 def measure(  # noqa: PLR0913 - one argument for each option
-    machine: MachineArgument,
     recipe: Annotated[
         str, typer.Option(help=f"One of: {RECIPES}; or a recipe FILE.toml (`abbe plan` writes one). Default: quick-check.")
     ] = "",
@@ -53,6 +53,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is in the store.")] = "",
     untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: the mounted instruments were not touched.")] = False,
     accept_table: AcceptTable = False,
+    machine: MachineOption = None,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
     from abbe.service.campaigns.resume import begun_source
@@ -65,8 +66,9 @@ def measure(  # noqa: PLR0913 - one argument for each option
     from abbe.service.storage.store import Store
 
     rehearsal = Rehearsal(dry_run, path, picture, nc, out)
-    instead = rehearsal.check((machine, Path(recipe)))
-    loaded = load_machine(machine)
+    file = machine_file(machine)
+    instead = rehearsal.check((file, Path(recipe)))
+    loaded = load_machine(file)
     site = site_of(loaded.machine)
     source = _source(recipe, helix, rate_hz)
     if resume:
@@ -177,13 +179,13 @@ def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
 
 
 def correct(
-    machine: MachineArgument,
     campaign: Annotated[str, typer.Argument(help="Identification campaign in the store.")],
     before: Annotated[str, typer.Option(help="Verification campaign measured with the present table; default: it is measured now.")] = "",
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
+    machine: MachineOption = None,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; roll back to the old table if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import rollback_when_safe, run_job
@@ -196,7 +198,7 @@ def correct(
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     check_certificates(site)
 
@@ -285,10 +287,10 @@ def warn_of_open_push(url: str, site: Site) -> None:
 
 
 def listen(
-    machine: MachineArgument,
     recipe: Annotated[Path, typer.Option(metavar="FILE.toml", help="The recipe from which the NC program was written; laser tests only.")],
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     accept_table: AcceptTable = False,
+    machine: MachineOption = None,
 ) -> None:
     """Record the laser while the operator runs the NC program of a recipe; each standstill of the program becomes a reading."""
     from abbe.service.campaigns.listen import listen_campaign
@@ -301,7 +303,7 @@ def listen(
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     title, recipes = read_recipe(recipe)
     plan = CampaignPlan(title, tuple(r.plan(site.machine) for r in recipes))

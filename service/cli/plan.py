@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.campaigns.plan import PlannedCampaign
@@ -16,7 +16,6 @@ HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "me
 
 
 def plan(
-    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help="Available minutes, set-ups included.")] = 60.0,
     goal_um: Annotated[
         float | None, typer.Option(min=0.001, help="Wanted worst U = 2u of the deviation, µm; the plan ends when it is reached.")
@@ -28,6 +27,7 @@ def plan(
     instruments: Annotated[
         Path | None, typer.Option("--instruments", metavar="FILE.toml", help="Bars, noise and set-up times; default: usual ones.")
     ] = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, and how far each measurement lowers U. Nothing moves."""
@@ -38,9 +38,10 @@ def plan(
     from abbe.service.rendering.page_file import write_page
     from abbe.service.site import site_of
 
-    site = site_of(load_machine(machine).machine)
+    file = machine_file(machine)
+    site = site_of(load_machine(file).machine)
     tools = read_instruments(instruments)
-    _check_targets((out, picture), (machine, instruments))
+    _check_targets((out, picture), (file, instruments))
     if picture is not None:
         form_of(picture)  # refuse a wrong suffix before the work
     with display() as sink:
@@ -87,4 +88,4 @@ def _print(planned: PlannedCampaign, out: Path | None, picture: Path | None) -> 
     if picture is not None:
         typer.echo(f"picture: {picture}")
     if out is not None:
-        typer.echo(f"recipe: {out}; run it with `abbe measure MACHINE.toml --recipe {out}`")
+        typer.echo(f"recipe: {out}; run it with `abbe measure -m MACHINE.toml --recipe {out}`")

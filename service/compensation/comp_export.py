@@ -377,7 +377,7 @@ def check_signing(doc: dict[str, Any], config: MachineFile | None, seal: TableSe
     """
     keys.read_key(seal.key)
     if config is None:
-        raise SignatureRefused("a signature needs a machine, and none is given", "give --machine FILE; nothing was written")
+        raise SignatureRefused("a signature needs a machine, and none is given", "give -m FILE; nothing was written")
     if not 0 < seal.days <= LONGEST_DAYS:
         raise SignatureRefused(f"a signature cannot hold for {seal.days:g} days", f"give more than 0 and at most {LONGEST_DAYS:g} days")
     name = doc["machine"].get("name")
@@ -415,7 +415,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     if not seal.exists():
         return SealStatus(None, "not signed")
     if config is None:
-        return SealStatus(None, "signed, but the machine is unknown: give --machine")
+        return SealStatus(None, "signed, but the machine is unknown: give -m FILE")
     try:
         sealed = read_plain(seal, LARGEST)
     except NotPlainError as error:

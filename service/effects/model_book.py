@@ -100,7 +100,7 @@ OPPOSITE = -0.8
 """Below this cosine between two findings' coefficients the later finding reverses the earlier one; otherwise it is another change."""
 FORM = 0.1
 """Relative standard uncertainty assumed for coefficients, because no machine follows a formula exactly."""
-LOOK = "`abbe model list MACHINE` shows all versions"
+LOOK = "`abbe model list` shows all versions"
 REMEDIES = {
     "table": "compensation tables",
     "control parameter": "a parameter of the control",

@@ -67,7 +67,7 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
     except REFUSALS as no:
         return JobOutcome("ended", f"no proposal: {no}; campaign {name!r} is kept; `abbe solve` shows its result")
     except BaseException as error:
-        error.add_note(f"campaign {name!r} is measured: `abbe comp propose MACHINE.toml {name!r}` solves it and proposes")
+        error.add_note(f"campaign {name!r} is measured: `abbe comp propose -m MACHINE.toml {name!r}` solves it and proposes")
         raise
 
 
@@ -87,8 +87,8 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
                 await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options)
             except BaseException as error:
                 error.add_note(
-                    f"completed runs of campaign {name!r} are kept: `abbe measure MACHINE.toml --resume {name!r}` resumes, then "
-                    f"`abbe comp propose MACHINE.toml {name!r}`"
+                    f"completed runs of campaign {name!r} are kept: `abbe measure -m MACHINE.toml --resume {name!r}` resumes, then "
+                    f"`abbe comp propose -m MACHINE.toml {name!r}`"
                 )
                 raise
 

@@ -33,7 +33,7 @@ from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures
 
 SOLUTION_SIGNS: dict[str, Sign] = {"good": "ok", "usable with care": "open", "mostly assumption": "bad"}
-NOT_JUDGED = "No limit is on record for these figures; a machine file (--machine) states limits."
+NOT_JUDGED = "No limit is on record for these figures; a machine file (-m) states limits."
 
 
 @dataclass(frozen=True)

@@ -133,7 +133,7 @@ def check_judged(run: Run) -> None:
     """
     why = not_judged(run)
     if why:
-        raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or resume it: abbe measure MACHINE.toml --resume")
+        raise MeasurementFault(f"run {run.run_id}: {why}", "measure it again, or resume it: abbe measure -m MACHINE.toml --resume")
 
 
 def _of_path(run: Run, start: RunStart) -> float | None:

@@ -175,7 +175,7 @@ class Prompts:
 
 
 T = TypeVar("T")
-STOPPED = Stopped("stopped as asked", "`abbe measure MACHINE.toml --resume CAMPAIGN` resumes it")
+STOPPED = Stopped("stopped as asked", "`abbe measure -m MACHINE.toml --resume CAMPAIGN` resumes it")
 ABORTED = Aborted("aborted as asked: the axes were stopped where they were", "look at the machine, then `abbe measure --resume`")
 
 

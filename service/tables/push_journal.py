@@ -245,7 +245,7 @@ class JournalView:
         if self.origin(kept[-1]).kind == KIND:
             raise TableRefused(
                 f"the last kept push ({kept[-1][-1].push}) was itself a rollback",
-                f"name the push with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+                f"name the push with abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
             )
         return kept[-1]
 
@@ -268,7 +268,7 @@ class JournalView:
         if known.crc != crc:
             raise TableRefused(
                 f"the table in force ({crc:08X}) is not the one of push {last[-1].push}, the last that was kept",
-                f"name the push with abbe comp rollback MACHINE.toml --to PUSH; {NOTHING}",
+                f"name the push with abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
             )
         return RollbackOffer(last[-1].push, crc, known.base_crc)
 
@@ -377,8 +377,9 @@ def operator_needed(journal: Journal, detail: str = "") -> TableMismatch:
     if known.controller.in_force == known.crc != NOT_YET:
         return TableMismatch(
             f"push {journal[-1].push}: {cause}: {STILL_ACTIVE} (CRC {known.crc:08X})",
-            "do not machine; restore the old table at the controller, or vouch for this one with `abbe accept-table MACHINE.toml`",
+            "do not machine; restore the old table at the controller, or vouch for this one with `abbe accept-table -m MACHINE.toml`",
         )
     return TableMismatch(
-        f"push {journal[-1].push}: {cause}", "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
+        f"push {journal[-1].push}: {cause}",
+        "look at the controller; if its table is right, say so with `abbe accept-table -m MACHINE.toml`",
     )

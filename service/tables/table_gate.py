@@ -148,10 +148,10 @@ def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
     return {crc: push for crc, push in candidates.items() if crc not in endorsed}
 
 
-LOOK_REMEDY = "look at the controller; if its table is right, say so with `abbe accept-table MACHINE.toml`"
+LOOK_REMEDY = "look at the controller; if its table is right, say so with `abbe accept-table -m MACHINE.toml`"
 STRANGE = "a table that this database did not push"
 ACCEPT_REMEDY = (
-    "find out who wrote this table; if it is right, accept it with `abbe accept-table MACHINE.toml --yes`, or repeat the command with "
+    "find out who wrote this table; if it is right, accept it with `abbe accept-table -m MACHINE.toml --yes`, or repeat the command with "
     "--accept-table; nothing has moved"
 )
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from pydantic import Field, computed_field
@@ -99,9 +100,9 @@ class VerifiedBy:
         return verdict if self.holds else self.state
 
 
-def measure_now(machine_file: str = "MACHINE.toml") -> str:
-    """Command that verifies a machine."""
-    return f"abbe measure {machine_file} --recipe quick-check"
+def measure_now(machine_file: Path) -> str:
+    """Return the command that verifies the machine of a machine file."""
+    return f"abbe measure -m {machine_file} --recipe quick-check"
 
 
 def minute(utc: datetime | None) -> str:

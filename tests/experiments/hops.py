@@ -142,7 +142,7 @@ def machine_text(ready: dict[str, Any], folder: Path) -> str:
 def quick_check() -> Hops:
     """`abbe measure --recipe quick-check` against a simulated machine."""
     with tempfile.TemporaryDirectory() as folder, simulated(Path(folder)) as machine:
-        return command("measure", str(machine), "--recipe", "quick-check", "--name", "hops")
+        return command("measure", "-m", str(machine), "--recipe", "quick-check", "--name", "hops")
 
 
 def solve(folder: str) -> Hops:

@@ -21,11 +21,12 @@ _HEAD = """# Commands
 Exit codes: 0 done, 1 the answer is no, 2 bad input or a fault (one line with a [code](error-codes.md) says what and what to do),
 129, 130, 143 closed terminal, Ctrl-C, SIGTERM.
 
-`--json`, where `abbe COMMAND --help` lists it, prints JSON on stdout. `--machine MACHINE.toml` takes the database of this machine file,
-`--db URL` a database directly; without both it is the one that `ABBE_DB` names, else `abbe.sqlite3`
-in the current folder. The tables below leave these three out where they say nothing else.
+`-m FILE` (`--machine FILE`) names the machine file; without it, it is the one that `ABBE_MACHINE` names, else `abbe.toml` in the current
+folder. A command works with the database of the machine file. `--db URL` names a database directly; without a machine it is the one that
+`ABBE_DB` names, else `abbe.sqlite3` in the current folder. `--json`, where `abbe COMMAND --help` lists it, prints JSON on stdout. The
+tables below leave these three out.
 """
-_COMMON = ("Print JSON on stdout.", "Machine file.", "Use the database of this machine file.", "Database. Default:")
+_COMMON = ("Print JSON on stdout.", "Machine file. Default:", "Database, instead of")
 
 
 def page() -> str:

@@ -91,9 +91,9 @@ async def typed(*words: str) -> tuple[int | None, str]:
 @pytest.mark.parametrize(
     ("words", "there"),
     [
-        (("measure", "FILE", "--recipe", "quick-check"), True),
-        (("measure", "FILE", "--recipe", "quick-check"), False),
-        (("comp", "push", "FILE", "1"), True),
+        (("measure", "-m", "FILE", "--recipe", "quick-check"), True),
+        (("measure", "-m", "FILE", "--recipe", "quick-check"), False),
+        (("comp", "push", "-m", "FILE", "1"), True),
     ],
     ids=["measure", "measure, none in the file", "comp push"],
 )

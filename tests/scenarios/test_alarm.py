@@ -188,11 +188,11 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
 
     # the trend begins anew with the table
     capsys.readouterr()
-    assert run(["trend", str(shop.sims.machine_file), "--json"]) == 0
+    assert run(["trend", "-m", str(shop.sims.machine_file), "--json"]) == 0
     figures = {f["figure"]: f for f in json.loads(capsys.readouterr().out)["figures"]}
     assert figures["helix_rms_um"]["checks"] < len([v for v in shop.store.verifications.of_machine("sim") if v.doc.get("values")])
     assert figures["helix_rms_um"]["latest"] < 4.0
-    assert run(["alarm", "list", str(shop.sims.machine_file), "--all", "--json"]) == 0
+    assert run(["alarm", "list", "-m", str(shop.sims.machine_file), "--all", "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]
     assert (doc["state"], doc["acknowledged_by"], doc["proposal"]) == ("closed", "otto", number)
     assert "kept: push 1: worst body diagonal" in doc["outcome"]
@@ -213,16 +213,16 @@ def test_once_checks_tells_raises_the_alarm_ends_with_1_and_says_what_a_bad_camp
     timetable = '[[schedule]]\nname = "weekly"\ncron = "0 6 * * 1"\nrecipe = "quick-check at 20 Hz"\non_alarm = "propose"\n'
     out = f'[verify]\nhelix_rms_um = 1\n[mqtt]\nurl = "{broker.url}"\ntopic_prefix = "plant/abbe"\n[web]\nport = 0\n{timetable}'
     sims = start_sims("--speed", "100", "--seed", "2", extra=out)
-    assert run(["serve", str(sims.machine_file), "--once"]) == 1, capsys.readouterr().err
+    assert run(["serve", "-m", str(sims.machine_file), "--once"]) == 1, capsys.readouterr().err
     capsys.readouterr()
     result = payload(heard.expect("sim/verification"))
     assert (result["verdict"], result["schedule"]) == ("fail", "weekly (once)")
-    assert run(["alarm", "list", str(sims.machine_file), "--json"]) == 0
+    assert run(["alarm", "list", "-m", str(sims.machine_file), "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]
     assert (doc["state"], doc["schedule"]) == ("raised", "weekly (once)")
     assert {(s["figure"], s["kind"]) for s in doc["signals"]} >= {("helix_rms_um", "limit")}
 
     with sims.machine_file.open("a") as file:
         file.write('[alarm]\ncampaign = "hour.toml"\n')
-    assert run(["serve", str(sims.machine_file), "--once"]) == 2
+    assert run(["serve", "-m", str(sims.machine_file), "--once"]) == 2
     assert re.search(r"error CFG-001: .*hour\.toml", capsys.readouterr().err)

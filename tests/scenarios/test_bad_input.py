@@ -36,23 +36,23 @@ def meanwhile(condition, what, do):
 
 
 def test_missing_machine_file(command):
-    refused(command("measure", "nowhere.toml"), "CFG-001", "nowhere.toml")
+    refused(command("measure", "-m", "nowhere.toml"), "CFG-001", "nowhere.toml")
 
 
 def test_unknown_key_names_the_nearest_valid_one(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text() + "[limits]\ntable_valu_um = 5\n")
-    refused(command("measure", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
+    refused(command("measure", "-m", "machine.toml"), "CFG-001", "table_valu_um", "table_value_um")
 
 
 def test_port_refused(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text().replace(still.ready["cnc"], "modbus+tcp://127.0.0.1:9?unit=1"))
-    refused(command("measure", "machine.toml"), "DRV-002", "127.0.0.1:9")
+    refused(command("measure", "-m", "machine.toml"), "DRV-002", "127.0.0.1:9")
 
 
 def test_a_path_beyond_the_stroke_moves_nothing(command, tmp_path, still):
     (tmp_path / "machine.toml").write_text(still.machine_file.read_text())
     before = position_and_counters(still)
-    refused(command("measure", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
+    refused(command("measure", "-m", "machine.toml", "--helix", "550,250,100,150"), "SEQ-001", "X", "stroke", "nothing has moved")
     assert position_and_counters(still) == before
     assert not (tmp_path / "abbe.sqlite3").exists() or runs_of(tmp_path) == []
 
@@ -60,7 +60,7 @@ def test_a_path_beyond_the_stroke_moves_nothing(command, tmp_path, still):
 def test_ball_bar_unplugged_in_mid_run(command, start_sims):
     sims = start_sims("--speed", "10")
     with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask("unplug_ballbar")):
-        ended = command("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+        ended = command("measure", "-m", str(sims.machine_file), "--helix", "300,250,100,150")
     refused(ended, "DRV-002", "unplugged")
     run = runs_of(sims.machine_file.parent)[-1]
     assert run.status == "failed"
@@ -77,7 +77,7 @@ def test_laser_beam_lost(command, start_sims, tmp_path):
     # The first readings of a line of 42 are stored: the beam goes while it is being read, not while it is zeroed for the next one.
     first = (lambda: 2 <= laser_chunks(sims.machine_file.parent) <= 20, "the first readings of a laser line")
     with meanwhile(*first, lambda: sims.ask("beam", blocked=True)):
-        ended = command("measure", str(sims.machine_file), "--recipe", "one.toml")
+        ended = command("measure", "-m", str(sims.machine_file), "--recipe", "one.toml")
     refused(ended, "ILK-007", "beam")
     run = runs_of(sims.machine_file.parent)[-1]
     assert (run.status, run.test) == ("failed", "laser_diagonal")
@@ -88,7 +88,7 @@ def test_laser_beam_lost(command, start_sims, tmp_path):
 def test_an_interlock_stops_the_run(command, start_sims, fault, word):
     sims = start_sims("--speed", "10")
     with meanwhile(lambda: bar_chunks(sims.machine_file.parent) > 5, "samples of the helix", lambda: sims.ask(fault, on=True)):
-        code, _, err = command("measure", str(sims.machine_file), "--helix", "300,250,100,150")
+        code, _, err = command("measure", "-m", str(sims.machine_file), "--helix", "300,250,100,150")
     assert code == 2
     last = err.strip().splitlines()[-1]
     assert last.startswith("error ")

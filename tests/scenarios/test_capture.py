@@ -31,7 +31,7 @@ HELIX = ("--helix", "300,250,100,150")
 def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims):
     sims = start_sims("--speed", "20")
     folder = sims.machine_file.parent
-    process = abbe("measure", str(sims.machine_file), *HELIX)
+    process = abbe("measure", "-m", str(sims.machine_file), *HELIX)
     wait_for(lambda: bar_chunks(folder) > 20, 60, "samples of the helix")
     process.kill()
     process.communicate()
@@ -39,7 +39,7 @@ def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims
     (run,) = runs_of(folder)
     assert (run.visible_status, run.end_doc) == ("incomplete", None)
     known = bar_chunks(folder)
-    again = abbe("measure", str(sims.machine_file), *HELIX, "--name", "again")
+    again = abbe("measure", "-m", str(sims.machine_file), *HELIX, "--name", "again")
     wait_for(lambda: runs_of(folder)[0].status != "running", 60, "the recovery")
     _, err = interrupt(again, signal.SIGINT)
     assert f"run {run.campaign}/{run.label}: interrupted" in err
@@ -57,7 +57,7 @@ def test_a_killed_measurement_is_taken_over_by_the_next_command(abbe, start_sims
 
 def test_a_whole_measurement_accounts_for_every_sample_of_the_box(start_sims, capsys):
     sims = start_sims("--speed", "20")
-    code = run(["measure", str(sims.machine_file), "--helix", "300,250,100,50", "--rate-hz", "1000"])
+    code = run(["measure", "-m", str(sims.machine_file), "--helix", "300,250,100,50", "--rate-hz", "1000"])
     assert code == 0, capsys.readouterr().err
     fates = sims.ask("ledger")["fates"]
     folder = sims.machine_file.parent

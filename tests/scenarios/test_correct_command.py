@@ -52,7 +52,7 @@ def test_a_table_over_its_limit_is_refused_and_nothing_is_written(command, ident
     limited = identified.machine_file.with_name("limited.toml")
     limited.write_text(identified.machine_file.read_text() + "[limits]\ntable_value_um = 1\n")
     before = registers(identified, 7, 2), registers(identified, 208, 8)
-    ended = command("correct", limited, "june", "--before", "start")
+    ended = command("correct", "-m", limited, "june", "--before", "start")
     refused(ended, "CMP-001", "limit", "1.0 µm", "table_value_um", "othing was written")
     assert (registers(identified, 7, 2), registers(identified, 208, 8)) == before  # generation; active bank, CRC and state of both banks
 
@@ -102,7 +102,9 @@ def copied(source: Path, target: Path) -> None:
 @pytest.fixture(scope="module")
 def killed(identified, tmp_path_factory) -> Killed:
     before, folder = table(identified), identified.machine_file.parent
-    process = subprocess.Popen([*ABBE, "correct", str(identified.machine_file), "june", "--before", "start"], stderr=subprocess.DEVNULL)
+    process = subprocess.Popen(
+        [*ABBE, "correct", "-m", str(identified.machine_file), "june", "--before", "start"], stderr=subprocess.DEVNULL
+    )
     wait_for(lambda: verifying(identified), 90, "the verification of the new table")
     process.kill()
     process.wait()
@@ -123,7 +125,7 @@ HELIX = ("--helix", "300,250,100,60")
 def test_after_a_kill_during_the_verification_measuring_takes_the_table_back_first_and_says_so(command, identified, killed):
     before = killed.before
     assert table(identified) == killed.after != before
-    _, err = done(command("measure", identified.machine_file, *HELIX))
+    _, err = done(command("measure", "-m", identified.machine_file, *HELIX))
     assert re.search(r"(^|; )push \d+ was not verified .*; the old table was made active again(; |$)", err, re.MULTILINE), err
     assert table(identified) == before
     doc = runs_of(identified.machine_file.parent)[-1].start_doc
@@ -133,13 +135,13 @@ def test_after_a_kill_during_the_verification_measuring_takes_the_table_back_fir
 def test_another_database_says_before_it_moves_that_it_did_not_push_the_table(command, killed, tmp_path):
     """It goes on where a person vouches for the table, remembers who did, and says so in every report."""
     machine = killed.machine(tmp_path, "elsewhere", tmp_path / "other.sqlite3")
-    helix = ("measure", machine, *HELIX, "--name", "h")
+    helix = ("measure", "-m", machine, *HELIX, "--name", "h")
     still = position_and_counters(killed.sims)
-    for words in (helix, ("comp", "commission", machine)):
+    for words in (helix, ("comp", "commission", "-m", machine)):
         refused(command(*words), "CMP-002", f"a table that this database did not push (CRC {killed.crc})", "--accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
     assert f"(CRC {killed.crc}) is accepted by " in done(command(*helix, "--accept-table"))[1]
-    done(command("measure", machine, *HELIX, "--name", "again"))  # it is remembered
+    done(command("measure", "-m", machine, *HELIX, "--name", "again"))  # it is remembered
     done(command("report", "h", "--machine", machine, "--out", "r.html"))
     page = (tmp_path / "r.html").read_text()
     assert f"a table that this database did not push (CRC {killed.crc}): accepted by " in page
@@ -147,7 +149,7 @@ def test_another_database_says_before_it_moves_that_it_did_not_push_the_table(co
 
 
 def test_a_rehearsal_says_from_the_journal_what_stands_open_under_the_old_name(command, killed, tmp_path):
-    _, err = done(command("measure", killed.machine(tmp_path, "mill-A"), "--dry-run"))
+    _, err = done(command("measure", "-m", killed.machine(tmp_path, "mill-A"), "--dry-run"))
     assert re.search(
         r"warning: push 1 is in state PROBED: an unverified table may be in force; it is rolled back before anything else", err
     )
@@ -164,14 +166,14 @@ def test_a_report_of_runs_on_an_unverified_table_says_so_and_does_not_pass(comma
 def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_until_a_person_accepts_it(command, killed, tmp_path):
     machine = killed.machine(tmp_path, "mill-A", host="localhost")
     still = position_and_counters(killed.sims)
-    for words in (("measure", machine, *HELIX), ("correct", machine, "june")):
+    for words in (("measure", "-m", machine, *HELIX), ("correct", "-m", machine, "june")):
         refused(command(*words), "CMP-002", f"(CRC {killed.crc}) is that of push 1 of machine 'sim'", "never verified", "accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
-    out, _ = done(command("accept-table", machine, "--yes"))
+    out, _ = done(command("accept-table", "-m", machine, "--yes"))
     assert "it is that of push 1 of machine 'sim', which no measurement has verified" in out
     old = tmp_path / "old.toml"  # under the old name it is closed, too: an accepted table is not taken back
     old.write_text(Path(machine).read_text().replace("mill-A", "sim").replace("localhost", "127.0.0.1"))
-    done(command("measure", old, *HELIX))
+    done(command("measure", "-m", old, *HELIX))
     assert table(killed.sims) == killed.after
 
 
@@ -188,16 +190,16 @@ body_diagonal_um = 500
 
 
 RENAMED = {
-    "measure": (("measure", "MACHINE", *HELIX), (0,)),
-    "push": (("comp", "push", "MACHINE", "1"), (1,)),
-    "serve": (("serve", "MACHINE", "--once"), (0,)),
+    "measure": (("measure", "-m", "MACHINE", *HELIX), (0,)),
+    "push": (("comp", "push", "-m", "MACHINE", "1"), (1,)),
+    "serve": (("serve", "-m", "MACHINE", "--once"), (0,)),
 }
 if os.environ.get("ABBE_TEST_LONG"):
     RENAMED |= {
-        "quick-check": (("measure", "MACHINE", "--recipe", "quick-check"), (0,)),
-        "correct": (("correct", "MACHINE", "june"), (2,)),  # the new name's control was never commissioned
-        "propose": (("comp", "propose", "MACHINE", "june"), (2,)),  # the campaign is the old name's
-        "commission": (("comp", "commission", "MACHINE", "--levels-only"), (0, 1)),  # last: it writes into the bank at rest
+        "quick-check": (("measure", "-m", "MACHINE", "--recipe", "quick-check"), (0,)),
+        "correct": (("correct", "-m", "MACHINE", "june"), (2,)),  # the new name's control was never commissioned
+        "propose": (("comp", "propose", "-m", "MACHINE", "june"), (2,)),  # the campaign is the old name's
+        "commission": (("comp", "commission", "-m", "MACHINE", "--levels-only"), (0, 1)),  # last: it writes into the bank at rest
     }
 """Commands that open the controller, and how they may end. All go through one helper (tests/service/devices/test_every_session.py), so
 every run plays three of them."""
@@ -220,7 +222,7 @@ def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_comman
 
 def test_commissioning_proves_what_the_control_does_with_a_correction_and_leaves_the_table(command, identified):
     before = table(identified)
-    out, _ = done(command("comp", "commission", identified.machine_file))
+    out, _ = done(command("comp", "commission", "-m", identified.machine_file))
     assert "proved: a positive correction moves its own axis in its positive sense" in out
     assert "the controller has level L3: unattended pushes" in out
     assert table(identified) == before
@@ -228,7 +230,7 @@ def test_commissioning_proves_what_the_control_does_with_a_correction_and_leaves
 
 def test_levels_only_says_what_was_proved_and_how_and_mounts_nothing(command, identified):
     before = table(identified)
-    doc = json.loads(done(command("comp", "commission", identified.machine_file, "--levels-only", "--json"))[0])
+    doc = json.loads(done(command("comp", "commission", "-m", identified.machine_file, "--levels-only", "--json"))[0])
     assert doc["levels"]["level"] == 3
     assert all(flag["proved"] and flag["how"] for flag in doc["levels"]["flags"].values())
     assert set(doc["levels"]["flags"]) == {"two_banks", "swap_compares", "generation", "boot_id", "interlocks", "lease"}
@@ -241,7 +243,7 @@ def test_levels_only_says_what_was_proved_and_how_and_mounts_nothing(command, id
 def test_a_correction_that_makes_nothing_better_goes_back_and_ends_with_1(abbe, identified):
     """The machine itself changes while the new table is being verified: last in this file, because it stays so."""
     before = table(identified)
-    process = abbe("correct", str(identified.machine_file), "june", "--before", "start")
+    process = abbe("correct", "-m", str(identified.machine_file), "june", "--before", "start")
     wait_for(lambda: verifying(identified), 90, "the verification of the new table")
     identified.ask("drift", axis="X", um_per_m=400.0)
     out, err = process.communicate(timeout=90)

@@ -113,7 +113,7 @@ def refuses(sims: Sims, tmp_path: Path, capsys: pytest.CaptureFixture[str], monk
     def measure(recipe: str, *more: str, **devices: str | None) -> str:
         path = machine_file(sims, tmp_path, devices)
         with pytest.raises(SystemExit) as ended:
-            cli.main(["measure", str(path), "--recipe", recipe, *more])
+            cli.main(["measure", "-m", str(path), "--recipe", recipe, *more])
         err = capsys.readouterr().err
         assert (ended.value.code, told(sims)) == (2, []), err
         assert re.fullmatch(r"error [A-Z]{3}-\d{3}: [^\n]+\n", err), err

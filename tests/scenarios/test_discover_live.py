@@ -43,7 +43,7 @@ def run(capsys, tmp_path, monkeypatch):
 
 def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, monkeypatch, tmp_path):
     sims = start_sims("--speed", "60")
-    assert run("measure", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
+    assert run("measure", "-m", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
     search = Asks()
     monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
     code, out, err = run("discover", "june", "--machine", sims.machine_file, "--live", "--report", "live.html")
@@ -78,7 +78,7 @@ sys.exit(cli.run(["discover", "june", "--machine", sys.argv[1], "--live"]))
 def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monkeypatch, tmp_path):
     sims = start_sims("--speed", "40")
     url = f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}"
-    assert run("measure", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
+    assert run("measure", "-m", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
 
     def added():
         with Store.open(url) as store:

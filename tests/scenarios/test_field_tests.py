@@ -23,7 +23,7 @@ def test_every_kind_of_test_is_measured_and_solved(abbe, start_sims, tmp_path):
     sims = start_sims("--seed", "6", "--speed", "90")
     (tmp_path / "field.toml").write_text(FIELD)
     db = f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    run(abbe, "measure", str(sims.machine_file), "--recipe", "field.toml", "--name", "field")
+    run(abbe, "measure", "-m", str(sims.machine_file), "--recipe", "field.toml", "--name", "field")
     solved = json.loads(run(abbe, "solve", "field", "--db", db, "--json"))
     labels = {"h1", "h2", "p1", "c1", "c2", "c3", "d1", "d2", "f1", "l1"}
     assert set(solved["runs"]) == labels

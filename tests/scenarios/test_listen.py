@@ -49,12 +49,12 @@ def test_a_program_that_the_operator_starts_gives_the_same_readings(abbe, comman
     machine = str(sims.machine_file)
     (tmp_path / "r.toml").write_text(RECIPE)
     for words in (("--nc", "linuxcnc", "--out", "r.ngc"), ("--name", "driven")):
-        assert command("measure", machine, "--recipe", "r.toml", *words)[0] == 0
+        assert command("measure", "-m", machine, "--recipe", "r.toml", *words)[0] == 0
     to_line, line, to_diagonal, diagonal, rest = sections((tmp_path / "r.ngc").read_text())
     assert rest == []
     gone = [k for k, block in enumerate(diagonal) if block[0] == "rest"][2]  # the operator's program has lost one dwell
     lost = [block for k, block in enumerate(diagonal) if k != gone]
-    listening = abbe("listen", machine, "--recipe", "r.toml", "--name", "heard")
+    listening = abbe("listen", "-m", machine, "--recipe", "r.toml", "--name", "heard")
     said = []
     steps = {"l1: waiting": to_line, "l1: listening": line, "d1: waiting": to_diagonal, "d1: listening": lost}
     watchdog = threading.Timer(200.0, listening.kill)

@@ -27,7 +27,7 @@ WHY = r"stopped: \d+\.\d % of the path; not judged"
 
 def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, start_sims, capsys):
     sims = start_sims("--speed", "10")
-    words = ("measure", str(sims.machine_file), "--helix", "300,250,100,60", "--name", "june")
+    words = ("measure", "-m", str(sims.machine_file), "--helix", "300,250,100,60", "--name", "june")
     process = abbe(*words)
     wait_for(lambda: bar_chunks(sims.machine_file.parent) > 3, 60, "samples of the helix")
     _, err = interrupt(process, signal.SIGINT)
@@ -50,7 +50,7 @@ def test_a_stopped_helix_gives_no_figure_until_the_rest_of_it_is_measured(abbe, 
     cli(["show", "helix", "--machine", str(sims.machine_file)])
     assert re.search(WHY, " ".join(capsys.readouterr().out.split()))
 
-    assert cli(["measure", str(sims.machine_file), "--resume", "june", "--untouched"]) == 0
+    assert cli(["measure", "-m", str(sims.machine_file), "--resume", "june", "--untouched"]) == 0
     with Store.open(f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}") as store:
         whole = next(r for r in store.runs.all() if r.status == "complete")
         run = load_run(store, whole.id)

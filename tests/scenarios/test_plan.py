@@ -19,13 +19,13 @@ def run(abbe, *words: str) -> str:
 def test_a_planned_campaign_is_measured_and_solved(abbe, start_sims, tmp_path):
     sims = start_sims("--seed", "5", "--speed", "60")
     machine = str(sims.machine_file)
-    planned = json.loads(run(abbe, "plan", machine, "--minutes", "14", "--out", "small.toml", "--picture", "small.html", "--json"))
+    planned = json.loads(run(abbe, "plan", "-m", machine, "--minutes", "14", "--out", "small.toml", "--picture", "small.html", "--json"))
     assert planned["minutes"] <= 14.0
     assert "<svg" in (tmp_path / "small.html").read_text()
     # the planner's minutes are the sequencer's machine time and the set-ups
     machine_min = sum(s["machine_s"] for s in planned["steps"]) / 60.0
     assert planned["minutes"] == pytest.approx(machine_min + setup_minutes(planned["steps"]), abs=0.3)
-    run(abbe, "measure", machine, "--recipe", "small.toml", "--name", "small", "--rate-hz", "100")
+    run(abbe, "measure", "-m", machine, "--recipe", "small.toml", "--name", "small", "--rate-hz", "100")
     solved = json.loads(run(abbe, "solve", "small", "--db", f"sqlite:///{tmp_path / 'abbe.sqlite3'}", "--json"))
     assert set(solved["runs"]) == {s["label"] for s in planned["steps"]}
 
@@ -47,7 +47,7 @@ def test_tests_that_share_a_set_up_run_one_after_the_other(abbe, start_sims, tmp
     """Another bar at the standing cup and back with it; two step orders and the straight diagonal on one mirror; one edge line."""
     sims = start_sims("--seed", "6", "--speed", "60")
     (tmp_path / "shared.toml").write_text(SHARED)
-    run(abbe, "measure", str(sims.machine_file), "--recipe", "shared.toml", "--name", "shared")
+    run(abbe, "measure", "-m", str(sims.machine_file), "--recipe", "shared.toml", "--name", "shared")
     solved = json.loads(run(abbe, "solve", "shared", "--db", f"sqlite:///{tmp_path / 'abbe.sqlite3'}", "--json"))
     assert set(solved["runs"]) == {"h1", "h2", "h3", "d1", "d2", "d3", "l1"}
     assert max(r["rms_um"] for r in solved["runs"].values()) < 1.5  # a cup that had moved would show as tens of micrometres

@@ -76,7 +76,7 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> Any:
         loaded = load_machine(sims.machine_file)
         site = site_of(loaded.machine)
         before = controller_words(sims)
-        code = run(["comp", "propose", str(sims.machine_file), "june"])
+        code = run(["comp", "propose", "-m", str(sims.machine_file), "june"])
         yield Shop(sims, site, loaded.database_url, before, code)
 
 
@@ -219,7 +219,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
         assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched
     capsys.readouterr()
-    assert run(["comp", "push", shop.file, str(plain), "--before", "start"]) == 2
+    assert run(["comp", "push", "-m", shop.file, str(plain), "--before", "start"]) == 2
     assert "error STO-001" in capsys.readouterr().err
     assert run(["comp", "show", "--machine", shop.file, "--json"]) == 0  # one bad row does not hide the others
     states = {p["number"]: p["state"] for p in json.loads(capsys.readouterr().out)["proposals"]}
@@ -245,16 +245,16 @@ def test_a_proposal_with_reasons_is_kept_to_look_at_and_goes_nowhere(shop, capsy
     strict = shop.sims.machine_file.with_name("strict.toml")
     strict.write_text(shop.sims.machine_file.read_text() + "table_value_um = 5\n")  # under [limits]
     capsys.readouterr()
-    assert run(["comp", "propose", str(strict), "june", "--json"]) == 1
+    assert run(["comp", "propose", "-m", str(strict), "june", "--json"]) == 1
     doc = json.loads(capsys.readouterr().out)
     assert doc["state"] == "refused"
     assert any(reason.startswith("VALUE") for reason in doc["reasons"])
     number = str(doc["number"])
     assert run(["comp", "approve", number, "--as", "anna", "--machine", str(strict)]) == 1
     assert "reasons against it" in capsys.readouterr().out
-    assert run(["comp", "push", str(strict), number, "--before", "start"]) == 1
+    assert run(["comp", "push", "-m", str(strict), number, "--before", "start"]) == 1
     assert "not pushed: VALUE" in capsys.readouterr().out
-    assert run(["comp", "push", shop.file, number, "--before", "start"]) == 1  # and not under wider limits either
+    assert run(["comp", "push", "-m", shop.file, number, "--before", "start"]) == 1  # and not under wider limits either
     assert "not pushed: LIMITS" in capsys.readouterr().out
     assert shop.words() == shop.untouched
 
@@ -283,7 +283,7 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
 
     # two people: the proposer cannot approve, nobody can push before somebody else has
     assert abbe("approve", "1", "--machine", shop.file)[0] == 1
-    assert abbe("push", shop.file, "1", "--before", "start")[0] == 1
+    assert abbe("push", "-m", shop.file, "1", "--before", "start")[0] == 1
     assert shop.words() == shop.untouched
     assert abbe("approve", "1", "--as", "anna", "--machine", shop.file)[0] == 0
     assert state() == "approved"
@@ -307,12 +307,12 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
             assert status_of_proposal(1, proposed, [], [], replace(journal, entries=journal.entries[:k]), now_s).word == word
         assert status_of_proposal(1, proposed, [], [], JournalView(), proposed.valid_until_s).word == "expired"
     pushed = shop.words()
-    code, out = abbe("push", shop.file, str(twin), "--before", "start")
+    code, out = abbe("push", "-m", shop.file, str(twin), "--before", "start")
     assert code == 1
     assert "not pushed: BASE" in out
     assert shop.words() == pushed
 
-    assert abbe("rollback", shop.file, "--yes")[0] == 0
+    assert abbe("rollback", "-m", shop.file, "--yes")[0] == 0
     assert active_crc(shop.sims) == base_crc(base)
     assert state() == "rolled back"
 

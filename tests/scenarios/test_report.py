@@ -138,7 +138,7 @@ def stored(tmp_path_factory) -> Iterator[Path]:
         (folder / "axis.toml").write_text(AXIS)
         (folder / "small.toml").write_text(SMALL)
         for name in ("axis", "small"):
-            command("measure", sims.machine_file, "--recipe", f"{name}.toml", "--name", name)
+            command("measure", "-m", sims.machine_file, "--recipe", f"{name}.toml", "--name", name)
         command("solve", "small", "--model", "rigid6", "--machine", sims.machine_file)
         command("discover", "axis", "--machine", sims.machine_file)
         asyncio.run(pushed(sims.machine_file))

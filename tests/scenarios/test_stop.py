@@ -40,7 +40,7 @@ class Measuring:
         return str(self.folder / "machine.toml")
 
     def helix_under_way(self, *more: str) -> subprocess.Popen[str]:
-        process = self.abbe("measure", self.file, *HELIX, *more)
+        process = self.abbe("measure", "-m", self.file, *HELIX, *more)
         self.wait()
         return process
 
@@ -70,9 +70,9 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on_but_no_other
     assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` resumes it"
     assert measuring.runs() == [("helix", "stopped")]
     for change in (("--helix", "300,250,100,90"), ("--recipe", "quick-check")):
-        line = refused(command("measure", measuring.file, "--resume", "june", *change), "SEQ-007")
+        line = refused(command("measure", "-m", measuring.file, "--resume", "june", *change), "SEQ-007")
         assert line.startswith("error SEQ-007: campaign 'june' was begun with another recipe")
-    code, out, err = command("measure", measuring.file, "--resume", "june")
+    code, out, err = command("measure", "-m", measuring.file, "--resume", "june")
     assert code == 0, err
     assert out == "measured: campaign 'june', 1 runs\n"
     assert "set-up B1 is still mounted: helix begins again" in err
@@ -117,7 +117,7 @@ def test_a_closed_terminal_stops_the_axes(measuring):
     pid, terminal = pty.fork()
     if pid == 0:
         os.chdir(measuring.folder)
-        os.execv(ABBE[0], [*ABBE, "measure", measuring.file, *HELIX])
+        os.execv(ABBE[0], [*ABBE, "measure", "-m", measuring.file, *HELIX])
     measuring.wait()
     os.close(terminal)
     _, status = os.waitpid(pid, 0)

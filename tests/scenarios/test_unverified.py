@@ -33,7 +33,7 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
 
     asyncio.run(kept())
     assert fleet(url, capsys)["verdict"] == "verified"
-    assert run(["measure", file, *QUICK, "--name", "first"]) == 0
+    assert run(["measure", "-m", file, *QUICK, "--name", "first"]) == 0
     assert re.search(r"^check 1: (pass|fail|cannot tell): ", capsys.readouterr().out, re.MULTILINE)
     first = fleet(url, capsys)
     assert first["verified"]["why"] == "check"
@@ -41,20 +41,20 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
 
     with Store.open(url) as store:
         before = len(store.pushes.entries("sim"))
-    assert run(["comp", "rollback", file]) == 2  # nobody is at the console
+    assert run(["comp", "rollback", "-m", file]) == 2  # nobody is at the console
     assert "add --yes" in capsys.readouterr().err
     with Store.open(url) as store:
         assert len(store.pushes.entries("sim")) == before
-    assert run(["comp", "rollback", file, "--yes"]) == 0
+    assert run(["comp", "rollback", "-m", file, "--yes"]) == 0
     out = capsys.readouterr().out
-    assert out.splitlines()[-1] == f"the machine is unverified now: abbe measure {file} --recipe quick-check"
+    assert out.splitlines()[-1] == f"the machine is unverified now: abbe measure -m {file} --recipe quick-check"
     line = fleet(url, capsys)
     assert (line["verdict"], line["verified"]["why"], line["figures"]) == ("unverified", "rollback", [])
     target = tmp_path / "first.json"
     assert run(["report", "first", "--machine", file, "--out", str(target)]) == 0
     assert "Unverified now. Unverified since the rollback of" in capsys.readouterr().out
 
-    assert run(["measure", file, *QUICK, "--name", "second"]) == 0
+    assert run(["measure", "-m", file, *QUICK, "--name", "second"]) == 0
     capsys.readouterr()
     assert fleet(url, capsys)["verified"]["why"] == "check"
     assert run(["report", "second", "--machine", file, "--out", str(target)]) == 0
@@ -76,9 +76,9 @@ def test_the_check_of_an_accepted_table_is_its_check_and_an_ended_certificate_ma
     asyncio.run(kept())
     good = sims.machine_file.read_text()
     sims.machine_file.write_text(good.replace("ballbar = 2099-12-31", "ballbar = 2020-03-31"))
-    assert run(["measure", file, *QUICK]) == 2
+    assert run(["measure", "-m", file, *QUICK]) == 2
     assert "a table that this database did not push" in capsys.readouterr().err
-    assert run(["measure", file, *QUICK, "--accept-table"]) == 0
+    assert run(["measure", "-m", file, *QUICK, "--accept-table"]) == 0
     out = capsys.readouterr().out
     assert "check 1: cannot tell: the certificate of the ball-bar ended on 2020-03-31, so the figures cannot be judged; " in out
     line = fleet(url, capsys)

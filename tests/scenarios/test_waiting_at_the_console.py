@@ -44,7 +44,7 @@ class AtTheConsole:
 def stopped(start_sims, tmp_path) -> Iterator[tuple[AtTheConsole, Sims]]:
     """A commissioning that an e-stop has ended while a test table is active: the command waits."""
     sims = start_sims("--speed", "60")
-    command = AtTheConsole(tmp_path, "comp", "commission", str(sims.machine_file))
+    command = AtTheConsole(tmp_path, "comp", "commission", "-m", str(sims.machine_file))
     try:
         wait_for(lambda: last_state(tmp_path) == "PROBATION", 90, "a test table in force")
         sims.ask("estop", on=True)

@@ -25,7 +25,7 @@ def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str])
     monkeypatch.setattr("abbe.service.logs.configure_logs", lambda: None)
 
     def lines(file: Path, *words: str) -> list[str]:
-        assert cli.run(["serve", str(file), *words]) == 2
+        assert cli.run(["serve", "-m", str(file), *words]) == 2
         out, err = capsys.readouterr()
         assert err.splitlines()[-1].startswith("error ")
         return [*out.splitlines(), *err.splitlines()]

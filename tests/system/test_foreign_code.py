@@ -109,7 +109,7 @@ def test_demo(traps: Path) -> None:
 def test_serve(traps: Path) -> None:
     port = free_port()
     (traps / "m.toml").write_text(MACHINE + f"port = {port}\n")
-    with abbe(traps, "serve", "m.toml"):
+    with abbe(traps, "serve", "-m", "m.toml"):
 
         def answer() -> str | None:
             with suppress(httpx.TransportError):

@@ -139,7 +139,7 @@ def serving(folder: Path) -> Iterator[tuple[Process, Page, str]]:
         text = sims.machine_file.read_text()
         sims.machine_file.write_text(text.replace(sims.ready["fixture"], "fixture+console:"))
         who = tokens(url)
-        with closing(abbe("serve", sims.machine_file)) as running, client(port) as http:
+        with closing(abbe("serve", "-m", sims.machine_file)) as running, client(port) as http:
             running.expect('"page up"')
             yield running, Page(http, sims, who), url
 

@@ -42,7 +42,9 @@ def test_two_services_check_at_once_into_one_database(
         Store.open(url).close()
         services = [
             stack.enter_context(
-                closing(Process(sys.executable, "-c", "from abbe.service.cli import main; main()", "serve", f, "--once", "--port", "0"))
+                closing(
+                    Process(sys.executable, "-c", "from abbe.service.cli import main; main()", "serve", "-m", f, "--once", "--port", "0")
+                )
             )
             for f in files
         ]
@@ -58,7 +60,7 @@ def test_two_services_check_at_once_into_one_database(
         assert [one.outcome for one in store.audit.events()].count("begun") == 2
     assert run(["audit", "verify", "--db", url]) == 0
     capsys.readouterr()
-    assert run(["fleet", "--store", url, "--json"]) == 0
+    assert run(["fleet", "--db", url, "--json"]) == 0
     lines = json.loads(capsys.readouterr().out)["machines"]
     assert [(one["machine"], one["state"], one["verdict"]) for one in lines] == [(name, "not running", "fail") for name in NAMES]
     assert {f["name"] for one in lines for f in one["figures"]} == {"body_diagonal_um", "helix_rms_um"}

@@ -115,7 +115,7 @@ def test_a_flood_costs_no_sample_and_leaves_the_page_usable(tmp_path: Path) -> N
     timetable = ["[[schedule]]", 'name = "yearly"', 'cron = "0 0 1 1 *"', 'recipe = "quick-check"']
     machine = Machine(tmp_path, 60.0, "[web]", f"port = {port}", *timetable)
     took_s: list[float] = []
-    with closing(machine.process), running(tmp_path, abbe("serve", machine.file), port, who) as made, Flood(port)() as flood:
+    with closing(machine.process), running(tmp_path, abbe("serve", "-m", machine.file), port, who) as made, Flood(port)() as flood:
         viewer, began_s = made.who["viewer"], time.monotonic()
         checks, number = 0, ""
         while not number or time.monotonic() - began_s < LASTS_S or made.job(number)["ended_utc"] is None:

@@ -81,7 +81,7 @@ def serving(folder: Path, speed: float) -> Iterator[Serving]:
         people.add("olga", "operator", PHRASE)
         token = people.add_token("olga", "test", ["read"], 5.0)
     machine = Machine(folder, speed, "[web]", f"port = {port}", *TIMETABLE)
-    with closing(machine.process), closing(abbe("serve", machine.file)) as process:
+    with closing(machine.process), closing(abbe("serve", "-m", machine.file)) as process:
         process.expect('"page up"')
         yield Serving(process, port, url, {"Authorization": f"Bearer {token}"})
         process.terminate()

@@ -116,7 +116,7 @@ def test_the_page_is_killed_during_a_check_and_no_sample_is_missing(tmp_path: Pa
     recipe = "quick-check at 50 Hz"
     timetable = ["[[schedule]]", 'name = "yearly"', 'cron = "0 0 1 1 *"', f'recipe = "{recipe}"']
     machine = Machine(tmp_path, 100.0, "[web]", f"port = {port}", *timetable)
-    with closing(machine.process), running(tmp_path, abbe("serve", machine.file), port, who) as abbe_serve:
+    with closing(machine.process), running(tmp_path, abbe("serve", "-m", machine.file), port, who) as abbe_serve:
         number = abbe_serve.start(recipe).json()["id"]
         with connect(f"ws://127.0.0.1:{port}/api/v1/live", additional_headers=who["viewer"]) as live:
             while not ((job := json.loads(live.recv(timeout=60))["job"]) and job["done"] > 0):

@@ -79,7 +79,7 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
         assert asyncio.run(table_in_force(cnc)) != before
 
         machine.file.write_text(good.replace(cnc, f"modbus+tcp://127.0.0.1:{free_port()}"))
-        with closing(abbe("serve", machine.file)) as away:
+        with closing(abbe("serve", "-m", machine.file)) as away:
             away.expect("cannot be closed")
             away.expect('"page up"')
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as http:
@@ -95,7 +95,7 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
         assert alarm["machine"] == "mill-7"
 
         machine.file.write_text(good)
-        with closing(abbe("serve", machine.file)) as back:
+        with closing(abbe("serve", "-m", machine.file)) as back:
             assert "the old table was made active again" in back.expect("is closed")
             back.expect('"page up"')
             assert httpx.get(f"http://127.0.0.1:{port}/api/v1/status", timeout=30).json()["attention"] == []

@@ -70,7 +70,7 @@ def test_an_approver_orders_the_table_back_and_an_operator_does_not(tmp_path: Pa
         old, new = asyncio.run(pushed(sims, tmp_path))
         assert old != new
         who = tokens(url)
-        with closing(abbe("serve", sims.machine_file)) as running, client(port) as http:
+        with closing(abbe("serve", "-m", sims.machine_file)) as running, client(port) as http:
             running.expect('"page up"')
 
             def order(name: str, crc: int = new, push: int = 1, key: str = "k1") -> httpx.Response:

@@ -64,7 +64,7 @@ def test_an_audit_that_cannot_be_written_is_said_when_the_service_starts(tmp_pat
     """In a process of its own: beside other tests, their traces would stand among its lines."""
     (tmp_path / "m.toml").write_text(MACHINE + "port = 0\n")
     (tmp_path / "abbe.sqlite3.audit-key").mkdir()
-    with closing(abbe("serve", tmp_path / "m.toml")) as process:
+    with closing(abbe("serve", "-m", tmp_path / "m.toml")) as process:
         assert process.wait() == 2
     assert process.lines[-1].startswith(f"error AUD-001: the audit cannot be used: {tmp_path}/abbe.sqlite3.audit-key: ")
     assert not any("Traceback" in line for line in process.lines)
@@ -76,7 +76,7 @@ def test_a_login_over_tls(tmp_path: Path) -> None:
     port = free_port()
     (tmp_path / "m.toml").write_text(MACHINE + f'port = {port}\ncertificate = "abbe.crt"\nkey = "abbe.key"\n')
     base = f"https://127.0.0.1:{port}"
-    with closing(abbe("serve", tmp_path / "m.toml")) as running:
+    with closing(abbe("serve", "-m", tmp_path / "m.toml")) as running:
         assert f"{base}/" in running.expect("serving")
         with httpx.Client(base_url=base, verify=ssl.create_default_context(cafile=tmp_path / "abbe.crt"), timeout=30) as client:
             assert client.get("/api/v1/status").status_code == 401

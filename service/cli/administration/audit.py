@@ -257,8 +257,12 @@ def _record(command: str, given: Mapping[str, Any], outcome: str, error: BaseExc
 def _database(given: Mapping[str, Any], url_of: Any) -> str:
     if given.get("keep") is not None:  # the demonstration's own database
         return f"sqlite:///{Path(given['keep']) / 'abbe.sqlite3'}"
-    file = given.get("machine_file") or given.get("machine")
-    return str(url_of(given.get("db"), file if isinstance(file, Path) else None))
+    from abbe.service.cli.common import machine_file
+
+    file = given.get("machine")
+    if "machine" in given and "db" not in given:  # a command that cannot work without a machine
+        file = machine_file(file)
+    return str(url_of(given.get("db"), file))
 
 
 def _missing(url: str) -> Path | None:

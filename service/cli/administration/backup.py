@@ -7,22 +7,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, print_json
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, print_json
 
 if TYPE_CHECKING:
     from abbe.service.backup.backup import BackupSource
 
-StoreOption = Annotated[
-    str | None, typer.Option("--store", "--db", metavar="URL", help="Database, instead of a machine file's.", show_default=False)
-]
-
 
 def backup(
-    places: Annotated[
-        list[Path], typer.Argument(metavar="[MACHINE.toml] TARGET", help="Machine file, and a new folder.", show_default=False)
-    ],
-    store: StoreOption = None,
+    target: Annotated[Path, typer.Argument(metavar="TARGET", help="New folder.", show_default=False)],
     without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
+    db: DbOption = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Copy the database, samples that are not yet in it, and the audit into a new folder, and check the copy. The service may run."""
@@ -30,8 +25,7 @@ def backup(
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document
 
-    source, target = _places(places, store, "TARGET")
-    made = back_up(source, target, SystemClock().utc, with_key=not without_key)
+    made = back_up(_source(db, machine), target, SystemClock().utc, with_key=not without_key)
     if as_json:
         print_json(document(made))
     else:
@@ -47,14 +41,13 @@ def backup(
 
 
 def restore(
-    places: Annotated[
-        list[Path], typer.Argument(metavar="[MACHINE.toml] BACKUP", help="Machine file, and the folder of a backup.", show_default=False)
-    ],
-    store: StoreOption = None,
+    folder: Annotated[Path, typer.Argument(metavar="BACKUP", help="Folder of a backup.", show_default=False)],
     replace: Annotated[bool, typer.Option("--replace", help="Set an existing database aside; it is renamed, not deleted.")] = False,
     audit_key: Annotated[
         Path | None, typer.Option("--audit-key", metavar="FILE", help="Key of the audit, for a backup without it.", show_default=False)
     ] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check a backup's files, schema and audit, then restore it. Refuse a database in use, or, without --replace, one that exists."""
@@ -62,8 +55,7 @@ def restore(
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document
 
-    into, folder = _places(places, store, "BACKUP")
-    done = restore_backup(folder, into, SystemClock().utc, replace=replace, key_file=audit_key)
+    done = restore_backup(folder, _source(db, machine), SystemClock().utc, replace=replace, key_file=audit_key)
     aside = [str(path) for path in done.aside]
     if as_json:
         print_json({"database": str(done.database), "backup": document(done.backup.listed), "audit_records": done.records, "aside": aside})
@@ -77,17 +69,12 @@ def restore(
         typer.echo(f"set aside: {path}")
 
 
-def _places(places: list[Path], store: str | None, last: str) -> tuple[BackupSource, Path]:
-    """Return the database and the backup folder that the arguments name; ``last``: the folder's name in the error text."""
+def _source(db: str | None, machine: Path | None) -> BackupSource:
+    """Return the database that the options name; of a machine file, with its folder of samples."""
     from abbe.service.backup.backup import BackupSource
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine
-    from abbe.service.errors import ConfigError
     from abbe.service.site import site_of
 
-    if len(places) != (2 if store is None else 1):
-        raise ConfigError("a database and one folder are needed", f"write MACHINE.toml {last}, or --store URL {last}")
-    if store is not None:
-        return BackupSource(store, CaptureSettings()), places[0]
-    loaded = load_machine(places[0])
-    return BackupSource(loaded.database_url, site_of(loaded.machine).capture, places[0]), places[1]
+    url, file = database_url(db, machine), named_machine(machine) if db is None else None
+    return BackupSource(url, CaptureSettings() if file is None else site_of(load_machine(file).machine).capture, file)

@@ -3,22 +3,19 @@
 from __future__ import annotations
 
 from datetime import datetime
-from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, machine_file, open_store, print_json, print_table
 
 alarm = typer.Typer(help="Alarms of the scheduled checks.", no_args_is_help=True)
-
-MachineFile = Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")]
 
 
 @alarm.command("list")
 def list_alarms(
-    machine: MachineFile,
     every: Annotated[bool, typer.Option("--all", help="Also alarms that are over and acknowledged.")] = False,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
@@ -26,7 +23,7 @@ def list_alarms(
     from abbe.service.queries.reader import json_value
     from abbe.service.queries.status import alarms
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     with open_store(loaded.database_url) as store:
         found = alarms(store, loaded.machine.name, every=every)
     if as_json:
@@ -44,27 +41,25 @@ def list_alarms(
 
 @alarm.command("acknowledge")
 def acknowledge(
-    machine: MachineFile,
     number: Annotated[int, typer.Argument(metavar="ALARM", help="Number of an alarm; abbe alarm list shows them.")],
     name: Annotated[
         str, typer.Option("--as", metavar="NAME", help="Who has seen the alarm. Default: the account.", show_default=False)
     ] = "",
+    machine: MachineOption = None,
 ) -> None:
     """Note that a person has seen an alarm. The alarm stays active until a check clears it."""
     from abbe.service.compensation.proposals import login
     from abbe.service.config import load_machine
     from abbe.service.verification.alarms import acknowledge as work
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     with open_store(loaded.database_url) as store:
         done = work(store, loaded.machine.name, number, name.strip() or login())
     typer.echo(f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc}")
 
 
 def fleet(
-    db: Annotated[
-        str | None, typer.Option("--store", "--db", metavar="URL", help="Database that the services write to.", show_default=False)
-    ] = None,
+    db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -88,7 +83,6 @@ def fleet(
 
 
 def trend(
-    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     after: Annotated[
         str | None,
         typer.Option(
@@ -98,6 +92,7 @@ def trend(
             show_default=False,
         ),
     ] = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show whether each judged figure is in control or drifts (since when), and the days until its limit, with their uncertainty."""
@@ -115,7 +110,7 @@ def trend(
         return
     known = found.verified
     if not known.holds:
-        typer.echo(f"{known.text}: {measure_now(str(machine))}" if known.state == "unverified" else known.text)
+        typer.echo(f"{known.text}: {measure_now(machine_file(machine))}" if known.state == "unverified" else known.text)
     if not found.figures and known.changes:
         typer.echo(f"no check of {found.machine} has figures since the present table came into force: --after UTC shows older ones")
         return

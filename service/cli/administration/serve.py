@@ -1,4 +1,4 @@
-"""``abbe serve MACHINE.toml``: the unattended service. Heavy modules are imported when it runs, not for ``--help``."""
+"""``abbe serve``: the unattended service. Heavy modules are imported when it runs, not for ``--help``."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
+from abbe.service.cli.common import MachineOption, machine_file
 from abbe.service.errors import AbbeError
 
 if TYPE_CHECKING:
@@ -39,18 +40,18 @@ LONGEST_NAME = 180
 
 
 def serve(
-    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     port: Annotated[int | None, typer.Option(help="Port of the status page, instead of [web] port; 0: any.", min=0, max=65535)] = None,
     once: Annotated[
         bool, typer.Option("--once", help="Run every recipe of the timetable once, now, and end; exit code 1 unless all pass.")
     ] = False,
+    machine: MachineOption = None,
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from abbe.service.config import load_machine
     from abbe.service.logs import configure_logs
     from abbe.service.serve import serve as run
 
-    setup = setup_of(load_machine(machine), port)
+    setup = setup_of(load_machine(machine_file(machine)), port)
     configure_logs()
     raise typer.Exit(run(setup, once=once))
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from abbe.service.children import python_command
-from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
@@ -59,7 +59,7 @@ def sim(context: typer.Context) -> None:
 
 
 def check_config(
-    file: Annotated[Path, typer.Argument(metavar="FILE", help="Machine file (TOML).", show_default=False)],
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values with their origins; exit code 2 if something cannot work."""
@@ -69,6 +69,7 @@ def check_config(
     from abbe.service.errors import ConfigError
     from abbe.service.secrets import mask_secrets, visible
 
+    file = machine_file(machine)
     loaded = load_machine(file)
     found = check_plausibility(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
     database = mask_secrets(loaded.database_url)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store
+from abbe.service.cli.common import DbOption, MachineOption, database_url, named_machine, open_store
 from abbe.service.cli.measure import AcceptTable
 from abbe.service.cli.results.solve import stored_campaign
 
@@ -37,20 +37,20 @@ def discover(  # noqa: PLR0913 - one argument for each option
     db: DbOption = None,
     machine: MachineOption = None,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
-    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine of --machine, and continue.")] = False,
+    live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine, and continue.")] = False,
     accept_table: AcceptTable = False,
 ) -> None:
     """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
-    only if --db or --machine names a database. After Ctrl-C the same command resumes.
+    only if --db or -m names a database. After Ctrl-C the same command resumes.
     """
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:
         form_of(report)  # refuse a wrong suffix before the work
     if live:
-        _check_live(campaign, machine)
+        machine = _checked_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
         job, journal = _started(found, store)
         finding = _searched(job, journal)
@@ -95,15 +95,16 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
     return job, DiscoveryJournal() if store is None else journal_of(store, job)
 
 
-def _check_live(campaign: str, machine: Path | None) -> None:
-    """Refuse --live, before anything is read, without a machine file or for a campaign in a folder."""
+def _checked_live(campaign: str, machine: Path | None) -> Path:
+    """Return the machine file for --live; refuse, before anything is read, if there is none or the campaign is in a folder."""
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
 
-    if machine is None:
-        raise ConfigError("--live needs the machine", "give --machine FILE")
+    if (found := named_machine(machine)) is None:
+        raise ConfigError("--live needs the machine", "give -m FILE")
     if is_folder(campaign):
         raise ConfigError("--live needs a campaign of the store, not a folder", "measure it with `abbe measure`")
+    return found
 
 
 def _run_live(
@@ -185,7 +186,7 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
             kept = (
                 f"discovery {journal.id} is in state {state}; the same command resumes there"
                 if journal.id
-                else "nothing is kept: the discovery of a folder is stored only with --db or --machine"
+                else "nothing is kept: the discovery of a folder is stored only with --db or -m"
             )
             typer.echo(f"stopped: {kept}", err=True)
             raise

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.domain.model_book import ModelVersion
@@ -18,21 +19,26 @@ model = typer.Typer(
     help="The model book of a machine: versions with their effects, where each came from, and how to revert.", no_args_is_help=True
 )
 
-Machine = Annotated[str, typer.Argument(metavar="MACHINE", help="Name of the machine.", show_default=False)]
+OfOption = Annotated[
+    str | None,
+    typer.Option(
+        "--of", metavar="NAME", help="Name of the machine. Default: the machine file's, else the database's only one.", show_default=False
+    ),
+]
 
 
 @model.command("list")
 def list_models(
-    machine: Annotated[str | None, typer.Argument(metavar="MACHINE", help="Only this machine's.", show_default=False)] = None,
+    of: Annotated[str | None, typer.Option("--of", metavar="NAME", help="Only this machine's.", show_default=False)] = None,
     db: DbOption = None,
-    machine_file: MachineOption = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """List the versions of models, oldest first; the last version of a machine is its current one."""
     from abbe.service.effects.model_book import versions
 
-    with open_store(database_url(db, machine_file)) as store:
-        found = versions(store, machine)
+    with open_store(database_url(db, machine)) as store:
+        found = versions(store, of)
     if as_json:
         print_json([_doc(m) for m in found])
         return
@@ -42,22 +48,22 @@ def list_models(
 
 @model.command("show")
 def show_model(
-    machine: Machine,
     version: Annotated[int | None, typer.Argument(metavar="VERSION", help="Default: the current one.", show_default=False)] = None,
+    of: OfOption = None,
     db: DbOption = None,
-    machine_file: MachineOption = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show one version: its effects with their size, their remedy, and the runs they came from."""
     from abbe.service.discovery.discovery_text import size_text
     from abbe.service.effects.model_book import REMEDIES
 
-    with open_store(database_url(db, machine_file)) as store:
-        found = _version(store, machine, version)
+    with open_store(database_url(db, machine)) as store:
+        found = _version(store, _name(store, of, db, machine), version)
     if as_json:
         print_json(_doc(found))
         return
-    typer.echo(f"machine {machine}, model version {found.version}: {found.book.why}")
+    typer.echo(f"machine {found.machine}, model version {found.version}: {found.book.why}")
     rows = [(e.full_title, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
     print_table(("effect", "size, U (k = 2)", "remedy", "from campaign"), rows)
     if found.book.gone:
@@ -69,11 +75,11 @@ def show_model(
 
 @model.command("diff")
 def diff_models(
-    machine: Machine,
     first: Annotated[int, typer.Argument(metavar="FIRST", help="Version.", show_default=False)],
     second: Annotated[int | None, typer.Argument(metavar="SECOND", help="Default: the current one.", show_default=False)] = None,
+    of: OfOption = None,
     db: DbOption = None,
-    machine_file: MachineOption = None,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the effects that were added, removed or resized between two versions."""
@@ -82,12 +88,13 @@ def diff_models(
     from abbe.service.effects.model_book import differences, version
     from abbe.service.rendering.numbers import with_uncertainty
 
-    with open_store(database_url(db, machine_file)) as store:
-        a, b = version(store, machine, first), _version(store, machine, second)
+    with open_store(database_url(db, machine)) as store:
+        name = _name(store, of, db, machine)
+        a, b = version(store, name, first), _version(store, name, second)
     found = differences(a, b, catalogue())
     if as_json:
         rows = [{"label": d.label, "what": d.what, "unit": d.unit, "before": _size(d.before), "after": _size(d.after)} for d in found]
-        print_json({"machine": machine, "first": a.version, "second": b.version, "differences": rows})
+        print_json({"machine": name, "first": a.version, "second": b.version, "differences": rows})
         return
     if not found:
         typer.echo(f"versions {a.version} and {b.version} hold the same effects")
@@ -102,21 +109,37 @@ def diff_models(
 
 @model.command("revert")
 def revert_model(
-    machine: Machine,
     version: Annotated[int, typer.Argument(metavar="VERSION", help="Make this version the current one.", show_default=False)],
+    of: OfOption = None,
     db: DbOption = None,
-    machine_file: MachineOption = None,
+    machine: MachineOption = None,
 ) -> None:
     """Make an older version current again. Nothing is deleted: a new version is appended."""
     from abbe.service.effects.model_book import revert
 
-    with open_store(database_url(db, machine_file)) as store:
-        number = revert(store, machine, version)
-    typer.echo(f"machine {machine}: version {number} is current; it equals version {version}")
+    with open_store(database_url(db, machine)) as store:
+        name = _name(store, of, db, machine)
+        number = revert(store, name, version)
+    typer.echo(f"machine {name}: version {number} is current; it equals version {version}")
 
 
 def _size(size: LabelSize | None) -> dict[str, float] | None:
     return None if size is None else {"strength": size.strength, "u": size.u}
+
+
+def _name(store: Store, of: str | None, db: str | None, machine: Path | None) -> str:
+    """Return the name of the machine: ``--of``, else the machine file's, else the only one in the database."""
+    from abbe.service.config import load_machine
+    from abbe.service.errors import ConfigError
+
+    if of is not None:
+        return of
+    if db is None and (file := named_machine(machine)) is not None:
+        return load_machine(file).machine.name
+    names = [one.name for one in store.machines.all()]
+    if len(names) != 1:
+        raise ConfigError(f"which machine? {store.url} holds {', '.join(names) or 'none'}", "add --of NAME")
+    return names[0]
 
 
 def _version(store: Store, machine: str, number: int | None) -> ModelVersion:

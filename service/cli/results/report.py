@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store, run_or_campaign
+from abbe.service.cli.common import DbOption, MachineOption, database_url, named_machine, open_store, run_or_campaign
 
 if TYPE_CHECKING:
     from abbe.service.rendering.document import Document
@@ -39,9 +39,10 @@ def report(
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
-    --machine FILE: use this machine file's database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2
-    is reduced to 20 °C. Nothing is measured or computed again; the same data give the same bytes.
+    The machine file gives database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2 is reduced to
+    20 °C. Nothing is measured or computed again; the same data give the same bytes.
     """
+    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
     from abbe.service.report.report import rules_of
@@ -49,7 +50,9 @@ def report(
 
     for target in out or []:
         form_of(target)  # refuse a wrong suffix before the work
-    rules = rules_of(None if machine is None else load_machine(machine).machine)
+    # A folder and another database may be of another machine: its file has to be named.
+    file = machine if db is not None or is_folder(what) else named_machine(machine)
+    rules = rules_of(None if file is None else load_machine(file).machine)
     # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
     document = _document(what, number, of, url, rules)

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, machine_file, print_json, print_table
 from abbe.service.cli.results.discover import opened
 
 if TYPE_CHECKING:
@@ -94,16 +94,19 @@ ROWS = 20
 
 
 def errors(
-    machine: Annotated[Path, typer.Option("--machine", metavar="FILE", help="Machine file (TOML), or a machine object (TOML or JSON).")],
     errors_file: Annotated[Path, typer.Option("--errors", metavar="FILE", help="Error functions (abbe-errors/1).")],
     points: Annotated[Path, typer.Option("--points", metavar="FILE", help="CSV: x_mm,y_mm,z_mm; optional direction_x.., tool_x_mm..")],
     exact: Annotated[bool, typer.Option("--exact", help="Finite rotations instead of first order.")] = False,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Compute the tool's deviation at given points of a machine whose error functions are known. Points outside the strokes are refused."""
+    """Compute the tool's deviation at given points of a machine whose error functions are known. Points outside the strokes are refused.
+
+    -m also takes a machine object (docs/schemas/machine.schema.json), as TOML or JSON.
+    """
     from abbe.service.verification.deviations import deviations, deviations_json
 
-    found = deviations(machine, errors_file, points, exact=exact)
+    found = deviations(machine_file(machine), errors_file, points, exact=exact)
     if as_json:
         for piece in deviations_json(found):  # one line: indenting a hundred thousand points takes seconds
             sys.stdout.write(piece)

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
@@ -79,7 +79,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
 
-    A folder's result is stored only if --db or --machine names a database. A run that contradicts its description is refused (exit code 2).
+    A folder's result is stored only if --db or -m names a database. A run that contradicts its description is refused (exit code 2).
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution
     from abbe.service.domain.solution_file import SolutionFile
@@ -114,7 +114,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             doc |= known.doc
             doc |= store_solution(store, found, doc)
             if report is not None:
-                _write_report(store, chosen, summary, doc, machine, report)
+                _write_report(store, chosen, summary, doc, machine if db is not None else named_machine(machine), report)
     if as_json:
         print_json(doc)
         return
@@ -335,7 +335,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Use this scheduler of a Dask cluster instead.", show_default=False)
     ] = None,
     store_solutions: Annotated[bool, typer.Option("--keep", help="Store each solution.")] = False,
-    db: Annotated[str | None, typer.Option("--store", "--db", metavar="URL", help="Database.", show_default=False)] = None,
+    db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:

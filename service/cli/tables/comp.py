@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.config_schema import MachineFile
@@ -57,9 +57,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     ] = False,
     sign: Annotated[
         Path | None,
-        typer.Option(
-            "--sign", metavar="KEY", help="Private key that signs for the machine of --machine; writes FILE.sig.", show_default=False
-        ),
+        typer.Option("--sign", metavar="KEY", help="Private key that signs for this machine; writes FILE.sig.", show_default=False),
     ] = None,
     days: Annotated[float, typer.Option("--days", help="With --sign: days in which the files may be imported.")] = 30.0,
     base: Annotated[str, typer.Option("--base", help="With --sign: fingerprint of the table that was active while measuring.")] = "none",
@@ -182,10 +180,11 @@ def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none:
 
 
 def _machine_file(file: Path | None) -> MachineFile | None:
-    """Return a machine file's content; None without one."""
+    """Return the content of the named machine file; None without one."""
     from abbe.service.config import load_machine
 
-    return None if file is None else load_machine(file).machine
+    found = named_machine(file)
+    return None if found is None else load_machine(found).machine
 
 
 def _machine(file: Path | None) -> Any:
@@ -196,8 +195,9 @@ def _machine(file: Path | None) -> Any:
     from abbe.service.config import load_machine
     from abbe.service.site import site_of
 
-    if file is not None:
-        return site_of(load_machine(file).machine).machine
+    found = named_machine(file)
+    if found is not None:
+        return site_of(load_machine(found).machine).machine
     return Machine("w-X-Y-b-Z-t", np.array([[0.0, 1.0]] * 3))
 
 

@@ -7,8 +7,19 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, reader
-from abbe.service.cli.measure import MachineArgument, ready_session
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    database_url,
+    machine_file,
+    named_machine,
+    open_store,
+    print_json,
+    print_table,
+    reader,
+)
+from abbe.service.cli.measure import ready_session
 
 if TYPE_CHECKING:
     from abbe.service.compensation.proposals import StoredProposal
@@ -20,8 +31,8 @@ ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Numbe
 
 
 def propose(
-    machine: MachineArgument,
     campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Identification campaign in the store.")],
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Solve a campaign and store the resulting tables as a proposal; nothing is written to the controller (exit code 1: objections)."""
@@ -34,7 +45,7 @@ def propose(
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> StoredProposal:
@@ -180,7 +191,8 @@ def _control(machine: Path | None, name: str) -> str:
     from abbe.service.config import load_machine
     from abbe.service.domain.machine import control_of
 
-    found = None if machine is None else load_machine(machine).machine
+    file = named_machine(machine)
+    found = None if file is None else load_machine(file).machine
     return control_of(found.devices.cnc) if found is not None and found.name == name else ""
 
 

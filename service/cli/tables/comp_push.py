@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import asyncio
-from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import JsonOption, print_json, print_table
-from abbe.service.cli.measure import AcceptTable, MachineArgument, ready_session, verification_before
+from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
+from abbe.service.cli.measure import AcceptTable, ready_session, verification_before
 from abbe.service.cli.tables.comp_proposals import ProposalArgument
 
 if TYPE_CHECKING:
@@ -21,7 +20,6 @@ if TYPE_CHECKING:
 
 
 def push(
-    machine: MachineArgument,
     proposal: ProposalArgument,
     before: Annotated[
         str, typer.Option(metavar="CAMPAIGN", help="Verification campaign measured with the present table; default: it is measured now.")
@@ -30,6 +28,7 @@ def push(
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
+    machine: MachineOption = None,
 ) -> None:
     """Push a proposal, test the signs of its tables, measure again; roll back if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import display, rollback_when_safe, run_job
@@ -40,7 +39,7 @@ def push(
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     hints: list[str] = []
 
@@ -68,12 +67,12 @@ def push(
 
 
 def rollback(
-    machine: MachineArgument,
     to: Annotated[
         int | None,
         typer.Option("--to", metavar="PUSH", help="To the table in force after this push; 0: before the first.", show_default=False),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask: I know that the machine is unverified afterwards.")] = False,
+    machine: MachineOption = None,
 ) -> None:
     """Restore the table that was in force before the last kept push: on a person's order, without measuring. Asks first."""
     from dataclasses import replace
@@ -88,7 +87,7 @@ def rollback(
     from abbe.service.storage.store import Store
     from abbe.service.verification.verified_by import measure_now
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> RollbackResult | str | None:
@@ -109,7 +108,7 @@ def rollback(
         typer.echo(found)
     else:
         typer.echo(f"the table is in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
-        typer.echo(f"the machine is unverified now: {measure_now(str(machine))}")
+        typer.echo(f"the machine is unverified now: {measure_now(loaded.path)}")
 
 
 async def _confirmed(to: int | None) -> bool:
@@ -121,8 +120,8 @@ async def _confirmed(to: int | None) -> bool:
 
 
 def accept_table(
-    machine: Annotated[Path, typer.Argument(metavar="MACHINE.toml", help="Machine file.")],
     yes: Annotated[bool, typer.Option("--yes", help="I have checked the controller: its active table is right.")] = False,
+    machine: MachineOption = None,
 ) -> None:
     """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, or if this
     database did not push the table. Closes open pushes under any machine name. The push journal records who and when.
@@ -137,7 +136,7 @@ def accept_table(
 
     if not yes:
         raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> str:
@@ -152,7 +151,6 @@ ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no pus
 
 
 def commission(
-    machine: MachineArgument,
     levels_only: Annotated[
         bool,
         typer.Option("--levels-only", help="Only prove the controller's level for pushes: one move of 3 mm, nothing is mounted."),
@@ -161,6 +159,7 @@ def commission(
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
     accept_table: AcceptTable = False,
+    machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
     """Send requests that the controller must refuse; then write a small known step for each axis and measure it with the ball-bar.
@@ -175,7 +174,7 @@ def commission(
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine)
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> tuple[ProvedLevels, SignCommissioning | None]:

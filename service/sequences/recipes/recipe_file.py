@@ -135,7 +135,7 @@ def recipe_source(path: Path) -> str:
     try:
         return path.read_text(encoding="utf-8")
     except FileNotFoundError:
-        raise ConfigError(f"recipe file {path} does not exist", "`abbe plan MACHINE.toml --out FILE.toml` writes one") from None
+        raise ConfigError(f"recipe file {path} does not exist", "`abbe plan -m MACHINE.toml --out FILE.toml` writes one") from None
     except OSError as error:
         raise ConfigError(f"recipe file {path} cannot be read: {error.strerror}", "give a readable TOML file") from None
     except UnicodeDecodeError:

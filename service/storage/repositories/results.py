@@ -247,7 +247,7 @@ def _moved_on(model: NewVersion, last: int | None) -> ModelMovedOn:
     have = "no model" if last is None else f"model version {last}"
     return ModelMovedOn(
         f"machine {model.machine!r} has {have} now, but the new version was made {made_on}: nothing was added",
-        f"look at the present model (`abbe model show {model.machine}`), then run this again",
+        f"look at the present model (`abbe model show --of {model.machine}`), then run this again",
     )
 
 

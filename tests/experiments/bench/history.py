@@ -98,8 +98,8 @@ def _copied(folder: Path, history: History) -> dict:
     copy, back = folder / "copy", folder / "back"
     back.mkdir()
     url, url_back = (f"sqlite:///{place / 'abbe.sqlite3'}" for place in (folder, back))
-    took = {"backup_s": _timed(lambda: _done("backup", "--store", url, copy))}
-    took["restore_s"] = _timed(lambda: _done("restore", "--store", url_back, copy))
+    took = {"backup_s": _timed(lambda: _done("backup", "--db", url, copy))}
+    took["restore_s"] = _timed(lambda: _done("restore", "--db", url_back, copy))
     return took | {"same": _told(url, history) == _told(url_back, history)}
 
 
@@ -120,7 +120,7 @@ def _told(url: str, history: History) -> tuple:
 def _served(folder: Path, name: str) -> Iterator[int]:
     """The real command, on a port of its own choice."""
     (folder / "machine.toml").write_text(FILE.format(name=name))
-    with closing(abbe("serve", folder / "machine.toml", "--port", "0")) as service:
+    with closing(abbe("serve", "-m", folder / "machine.toml", "--port", "0")) as service:
         yield int(json.loads(service.expect('"serving"'))["page"].rstrip("/").rpartition(":")[2])
         service.terminate()
 

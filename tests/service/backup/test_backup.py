@@ -60,7 +60,7 @@ def test_while_another_process_writes_nothing_acknowledged_is_missing(shop: Shop
     for k in range(4):
         writer.drain(10)
         target = tmp_path / f"backup-{k}"
-        assert run(["backup", str(shop.machine), str(target)]) == 0
+        assert run(["backup", "-m", str(shop.machine), str(target)]) == 0
         assert prove_copy(target / "abbe.sqlite3") == read_backup(target).listed.schema
         numbers = [row[0] for row in rows_of(target / "abbe.sqlite3", "SELECT id FROM verifications ORDER BY id")]
         assert numbers == list(range(1, len(numbers) + 1))  # one instant: a prefix of what was written
@@ -77,9 +77,9 @@ def test_a_database_that_is_written_between_all_steps_is_copied_in_one(shop: Sho
 
 
 def test_what_the_database_does_not_have_yet_is_in_it(shop: Shop, tmp_path: Path) -> None:
-    assert run(["backup", str(shop.machine), str(tmp_path / "backup")]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "backup")]) == 0
     elsewhere = new_machine_file(tmp_path / "elsewhere")
-    assert run(["restore", str(elsewhere), str(tmp_path / "backup")]) == 0
+    assert run(["restore", "-m", str(elsewhere), str(tmp_path / "backup")]) == 0
     with Store.open(f"sqlite:///{elsewhere.parent / 'abbe.sqlite3'}") as store:
         assert len(store.chunks.of_run(shop.run_id, "bar")) == 4
         (done,) = recover_segments(store, CaptureSettings())
@@ -91,14 +91,14 @@ def test_what_the_database_does_not_have_yet_is_in_it(shop: Shop, tmp_path: Path
 
 def test_only_its_owner_can_read_it_and_nothing_is_overwritten(shop: Shop, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     target = tmp_path / "backup"
-    assert run(["backup", str(shop.machine), str(target)]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(target)]) == 0
     capsys.readouterr()
     modes = {path.relative_to(target).as_posix(): stat.S_IMODE(path.stat().st_mode) for path in [target, *target.rglob("*")]}
     assert modes.pop(".") == modes.pop("capture") == 0o700
     assert set(modes) == {"abbe.sqlite3", "audit-head", "audit-key", "backup.json", "machine.toml", "capture/run-00000001.seg"}
     assert set(modes.values()) == {0o600}
     before = (target / "backup.json").read_bytes()
-    assert run(["backup", str(shop.machine), str(target)]) == 2
+    assert run(["backup", "-m", str(shop.machine), str(target)]) == 2
     assert "error STO-004" in capsys.readouterr().err
     assert (target / "backup.json").read_bytes() == before
     with Store.open(shop.url) as store:
@@ -113,14 +113,14 @@ def test_killed_at_any_moment_it_is_whole_or_not_there(shop: Shop, tmp_path: Pat
     outcomes = set()
     for k in (1, 2, 5):
         target = tmp_path / f"backup-{k}"
-        with subprocess.Popen([*ABBE, "backup", str(shop.machine), str(target)], stdout=subprocess.DEVNULL) as child:
+        with subprocess.Popen([*ABBE, "backup", "-m", str(shop.machine), str(target)], stdout=subprocess.DEVNULL) as child:
             _wait_for_part(tmp_path, target, child, k)
             child.send_signal(signal.SIGKILL)
         outcomes.add(target.exists())
         if target.exists():
             read_backup(target)
     assert False in outcomes  # some were hit in the middle
-    assert run(["backup", str(shop.machine), str(tmp_path / "whole")]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "whole")]) == 0
 
 
 def _wait_for_part(folder: Path, target: Path, child: subprocess.Popen[bytes], step: int) -> None:
@@ -141,7 +141,7 @@ def test_a_locked_or_damaged_database_leaves_nothing_behind(shop: Shop, tmp_path
     for at in range(8192, len(data), 4096):
         data[at : at + 64] = bytes(64)
     shop.database.write_bytes(data)
-    assert run(["backup", str(shop.machine), str(tmp_path / "backup")]) == 2
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "backup")]) == 2
     assert not [path for path in tmp_path.iterdir() if "backup" in path.name]
 
 
@@ -150,9 +150,9 @@ def test_a_changed_audit_is_copied_and_told(shop: Shop, tmp_path: Path, capsys: 
         database.execute("DROP TRIGGER audit_no_update")
         database.execute("UPDATE audit SET who = 'user:eve' WHERE id = 3")
         database.commit()
-    assert run(["backup", str(shop.machine), str(tmp_path / "backup")]) == 1
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "backup")]) == 1
     assert "record 3 was changed" in capsys.readouterr().out
-    assert run(["restore", str(new_machine_file(tmp_path / "elsewhere")), str(tmp_path / "backup")]) == 2
+    assert run(["restore", "-m", str(new_machine_file(tmp_path / "elsewhere")), str(tmp_path / "backup")]) == 2
     assert "is broken: record 3 was changed after it was written" in capsys.readouterr().err
     assert not (tmp_path / "elsewhere" / "abbe.sqlite3").exists()
 
@@ -161,14 +161,14 @@ def test_a_changed_audit_is_copied_and_told(shop: Shop, tmp_path: Path, capsys: 
     ("words", "told"),
     [
         (
-            ["--store", "postgresql://me:topsecret@127.0.0.1/abbe", "x"],
+            ["--db", "postgresql://me:topsecret@127.0.0.1/abbe", "x"],
             "postgresql://me:***@127.0.0.1/abbe is on a PostgreSQL server - copy it with pg_dump",
         ),
-        (["--store", "sqlite://", "x"], "in memory only"),
-        (["--store", "sqlite:///none.sqlite3", "x"], "there is no database none.sqlite3"),
-        (["x"], "write MACHINE.toml TARGET, or --store URL TARGET"),
-        (["--store", "sqlite:///abbe.sqlite3", "a", "b"], "a database and one folder are needed"),
-        (["--store", "sqlite:///abbe.sqlite3", "nowhere/x"], "nowhere/x cannot be made: No such file or directory"),
+        (["--db", "sqlite://", "x"], "in memory only"),
+        (["--db", "sqlite:///none.sqlite3", "x"], "there is no database none.sqlite3"),
+        (["x", "-m", "m.toml", "--db", "sqlite://"], "--db and -m both name a database"),
+        (["--db", "sqlite:///abbe.sqlite3", "a", "b"], "unexpected extra argument"),
+        (["--db", "sqlite:///abbe.sqlite3", "nowhere/x"], "nowhere/x cannot be made: No such file or directory"),
     ],
 )
 def test_bad_input_is_one_line(shop: Shop, words: list[str], told: str, capsys: pytest.CaptureFixture[str], monkeypatch) -> None:
@@ -182,7 +182,7 @@ def test_bad_input_is_one_line(shop: Shop, words: list[str], told: str, capsys: 
 
 def test_a_backup_is_read_only_as_it_was_written(shop: Shop, tmp_path: Path) -> None:
     target = tmp_path / "backup"
-    assert run(["backup", str(shop.machine), str(target), "--json"]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(target), "--json"]) == 0
     for name in json.loads((target / "backup.json").read_text())["files"]:
         good = (target / name).read_bytes()
         (target / name).write_bytes(good[:-1] + bytes([good[-1] ^ 1]))

@@ -29,7 +29,7 @@ HOLDER = (
 
 @pytest.fixture
 def made(shop: Shop, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Path:
-    assert run(["backup", str(shop.machine), str(tmp_path / "backup")]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "backup")]) == 0
     capsys.readouterr()
     return tmp_path / "backup"
 
@@ -44,7 +44,7 @@ def answers(machine: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, obje
     found: dict[str, object] = {}
     at = ["--machine", str(machine)]
     for name, words in {
-        "trend": ["trend", str(machine)],
+        "trend": ["trend", "-m", str(machine)],
         "runs": ["runs", *at],
         "solve": ["solve", "c1-shop", "--model", "rigid6", *at],
     }.items():
@@ -67,8 +67,8 @@ def test_a_restored_database_gives_identical_answers(
         (folder / entry["file"]).write_text(json.dumps(one))
     with Store.open(shop.url) as store:
         import_folder(store, folder)
-    assert run(["backup", str(shop.machine), str(tmp_path / "backup")]) == 0
-    assert run(["restore", str(elsewhere), str(tmp_path / "backup")]) == 0
+    assert run(["backup", "-m", str(shop.machine), str(tmp_path / "backup")]) == 0
+    assert run(["restore", "-m", str(elsewhere), str(tmp_path / "backup")]) == 0
     assert "records: none missing, none changed" in capsys.readouterr().out
     assert answers(elsewhere, capsys) == answers(shop.machine, capsys)
     with Store.open(f"sqlite:///{elsewhere.parent / 'abbe.sqlite3'}") as store:
@@ -84,12 +84,12 @@ def test_a_database_in_use_is_left_alone_even_when_it_may_be_replaced(shop: Shop
         assert child.stdout is not None
         assert child.stdin is not None
         assert child.stdout.readline() == b"open\n"
-        assert run(["restore", str(shop.machine), str(made), "--replace"]) == 2
+        assert run(["restore", "-m", str(shop.machine), str(made), "--replace"]) == 2
         assert f"is in use by process {child.pid}" in capsys.readouterr().err
         child.stdin.close()
     with closing(sqlite3.connect(shop.database, isolation_level=None)) as other:  # and one that writes in this very process
         other.execute("BEGIN IMMEDIATE")
-        assert run(["restore", str(shop.machine), str(made), "--replace"]) == 2
+        assert run(["restore", "-m", str(shop.machine), str(made), "--replace"]) == 2
         assert "is in use by another process" in capsys.readouterr().err
         other.execute("ROLLBACK")
     assert shop.database.read_bytes() == before
@@ -98,9 +98,9 @@ def test_a_database_in_use_is_left_alone_even_when_it_may_be_replaced(shop: Shop
 def test_an_existing_database_is_only_put_aside_when_asked(shop: Shop, made: Path, capsys: pytest.CaptureFixture[str]) -> None:
     with Store.open(shop.url) as store:
         store.verifications.add(1, None, "pass", {"late": True})
-    assert run(["restore", str(shop.machine), str(made)]) == 2
+    assert run(["restore", "-m", str(shop.machine), str(made)]) == 2
     assert "exists - give --replace" in capsys.readouterr().err
-    assert run(["restore", str(shop.machine), str(made), "--replace", "--json"]) == 0
+    assert run(["restore", "-m", str(shop.machine), str(made), "--replace", "--json"]) == 0
     aside = [Path(name) for name in json.loads(capsys.readouterr().out)["aside"]]
     old = next(path for path in aside if path.name.startswith("abbe.sqlite3.replaced-") and not path.name.endswith("-journal"))
     with Store.open(f"sqlite:///{old}") as store:
@@ -116,7 +116,7 @@ def test_a_damaged_file_is_named_and_nothing_restored(made: Path, elsewhere: Pat
     data = bytearray((made / name).read_bytes())
     data[len(data) // 2] ^= 1
     (made / name).write_bytes(data)
-    assert run(["restore", str(elsewhere), str(made)]) == 2
+    assert run(["restore", "-m", str(elsewhere), str(made)]) == 2
     assert f"{name} is not as it was written" in capsys.readouterr().err
     assert [path.name for path in elsewhere.parent.iterdir()] == ["machine.toml"]
 
@@ -145,7 +145,7 @@ def test_what_was_changed_on_purpose_is_refused(
     made: Path, elsewhere: Path, statement: str, told: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     _edited(made, statement)
-    assert run(["restore", str(elsewhere), str(made)]) == 2
+    assert run(["restore", "-m", str(elsewhere), str(made)]) == 2
     err = capsys.readouterr().err
     assert err.count("\n") == 1
     assert told in err
@@ -154,16 +154,16 @@ def test_what_was_changed_on_purpose_is_refused(
 
 def test_without_its_key_it_is_asked_for(shop: Shop, tmp_path: Path, elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:
     backup = str(tmp_path / "backup")
-    assert run(["backup", str(shop.machine), backup, "--without-key"]) == 0
+    assert run(["backup", "-m", str(shop.machine), backup, "--without-key"]) == 0
     assert "abbe restore needs it" in capsys.readouterr().out
     assert not (tmp_path / "backup" / "audit-key").exists()
-    assert run(["restore", str(elsewhere), backup]) == 2
+    assert run(["restore", "-m", str(elsewhere), backup]) == 2
     assert "give --audit-key FILE" in capsys.readouterr().err
     other = tmp_path / "other-key"
     other.write_bytes(bytes(32))
-    assert run(["restore", str(elsewhere), backup, "--audit-key", str(other)]) == 2
+    assert run(["restore", "-m", str(elsewhere), backup, "--audit-key", str(other)]) == 2
     assert "sealed with another key" in capsys.readouterr().err
-    assert run(["restore", str(elsewhere), backup, "--audit-key", str(shop.folder / "abbe.sqlite3.audit-key")]) == 0
+    assert run(["restore", "-m", str(elsewhere), backup, "--audit-key", str(shop.folder / "abbe.sqlite3.audit-key")]) == 0
     assert run(["audit", "verify", "--machine", str(elsewhere)]) == 0
 
 
@@ -179,7 +179,7 @@ def test_cut_off_at_any_step_there_is_the_old_database_or_none(shop: Shop, made:
         return move(source, target)
 
     monkeypatch.setattr(shutil, "move", moving)
-    assert run(["restore", str(shop.machine), str(made), "--replace"]) == 2
+    assert run(["restore", "-m", str(shop.machine), str(made), "--replace"]) == 2
     monkeypatch.undo()
     assert count[0] == step
     assert not shop.database.exists()
@@ -189,7 +189,7 @@ def test_cut_off_at_any_step_there_is_the_old_database_or_none(shop: Shop, made:
     assert old.read_bytes() == before
     assert not list(shop.folder.glob(".*restoring*"))
     monkeypatch.setattr("abbe.service.clock.SystemClock.utc", lambda _: _later())
-    assert run(["restore", str(shop.machine), str(made), "--replace"]) == 0
+    assert run(["restore", "-m", str(shop.machine), str(made), "--replace"]) == 0
 
 
 def _later() -> object:
@@ -206,9 +206,9 @@ def test_in_a_folder_for_several_databases_the_audits_are_kept_apart(
     for ending in ("key", "head"):  # as an earlier version has named them there
         shutil.move(shop.folder / f"abbe.sqlite3.audit-{ending}", tmp_path / "audit" / f"abbe.sqlite3.audit-{ending}")
     monkeypatch.setenv("ABBE_AUDIT_FOLDER", str(tmp_path / "audit"))
-    assert run(["restore", str(elsewhere), str(made)]) == 0
+    assert run(["restore", "-m", str(elsewhere), str(made)]) == 0
     for machine in (shop.machine, elsewhere):
-        assert run(["backup", str(machine), str(tmp_path / f"again-{machine.parent.name}")]) == 0
+        assert run(["backup", "-m", str(machine), str(tmp_path / f"again-{machine.parent.name}")]) == 0
         assert run(["audit", "verify", "--machine", str(machine)]) == 0
     assert len(list((tmp_path / "audit").glob("abbe.sqlite3*.audit-key"))) == 2
 
@@ -225,7 +225,7 @@ def test_what_no_backup_holds_is_not_followed(
         os.mkfifo(path)
     else:
         path.symlink_to("/dev/zero" if odd == "link to a device" else "/etc")
-    assert run(["restore", str(elsewhere), str(made)]) == 2
+    assert run(["restore", "-m", str(elsewhere), str(made)]) == 2
     said = capsys.readouterr().err
     assert "it is a pipe" in said if odd == "list" else f"{path} is not of this backup" in said
     assert not (elsewhere.parent / "abbe.sqlite3").exists()

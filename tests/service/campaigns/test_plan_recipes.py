@@ -252,7 +252,19 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     machine, out, page = tmp_path / "m.toml", tmp_path / "p.toml", tmp_path / "p.html"
     machine.write_text(MACHINE_TOML)
     (tmp_path / "i.toml").write_text("bar_lengths_mm = [100.0, 150.0]\nlaser = false\n[setup]\ncup_min = 2.0\n")
-    words = ["plan", str(machine), "--minutes", "9", "--out", str(out), "--picture", str(page), "--instruments", str(tmp_path / "i.toml")]
+    words = [
+        "plan",
+        "-m",
+        str(machine),
+        "--minutes",
+        "9",
+        "--out",
+        str(out),
+        "--picture",
+        str(page),
+        "--instruments",
+        str(tmp_path / "i.toml"),
+    ]
     found = CliRunner().invoke(app, [*words, "--goal-um", "1"])
     assert found.exit_code == 0, found.output
     assert "goal 1 µm is not reached" in found.output
@@ -262,7 +274,7 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     assert "<polyline" in html
     assert "http" not in html
     machine.write_text(MACHINE_TOML + '[devices]\ncnc = "modbus+tcp://h:1"\nballbar = "socket://h:1"\nfixture = "fixture+console:"\n')
-    dry = CliRunner().invoke(app, ["measure", str(machine), "--recipe", str(out), "--dry-run"])
+    dry = CliRunner().invoke(app, ["measure", "-m", str(machine), "--recipe", str(out), "--dry-run"])
     assert dry.exit_code == 0, dry.output
     assert "of machine time" in dry.output
     assert read_recipe(out)[0] in dry.output  # the campaign is called what the recipe is called
@@ -275,7 +287,7 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
 def test_a_file_that_cannot_be_written_is_one_line_before_anything_is_planned(tmp_path, monkeypatch, out, option):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "m.toml").write_text(MACHINE_TOML)
-    found = CliRunner().invoke(app, ["plan", "m.toml", "--minutes", "60", option, out])
+    found = CliRunner().invoke(app, ["plan", "-m", "m.toml", "--minutes", "60", option, out])
     assert isinstance(found.exception, ConfigError) or found.exit_code == 2
     assert (tmp_path / "m.toml").read_text() == MACHINE_TOML
 

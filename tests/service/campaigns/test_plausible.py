@@ -93,7 +93,7 @@ def looked_at(path: Path) -> Plausibility:
 
 def checked(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> tuple[int, str, str]:
     with pytest.raises(SystemExit) as ended:
-        cli.main(["check-config", str(path), *more])
+        cli.main(["check-config", "-m", str(path), *more])
     out, err = capsys.readouterr()
     return int(ended.value.code or 0), out, err
 

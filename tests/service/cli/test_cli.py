@@ -81,7 +81,7 @@ def test_help_imports_nothing_heavy() -> None:
 
 
 def test_check_config(abbe: Abbe, machine: Path) -> None:
-    result = abbe("check-config", machine)
+    result = abbe("check-config", "-m", machine)
     assert result.code == 0
     lines = [line.split() for line in result.out.splitlines()]
     assert ["chain", '"w-X-Y-b-Z-t"', "file"] in lines
@@ -92,27 +92,27 @@ def test_check_config(abbe: Abbe, machine: Path) -> None:
 
 def test_check_config_json(abbe: Abbe, machine: Path, clean_environment: pytest.MonkeyPatch) -> None:
     clean_environment.setenv("ABBE_WEB__PORT", "9000")
-    found = json.loads(abbe("check-config", machine, "--json").out)
+    found = json.loads(abbe("check-config", "-m", machine, "--json").out)
     assert found["values"]["web.port"] == {"value": 9000, "origin": "environment"}
     assert found["values"]["mqtt.url"]["value"] == "mqtt://me:***@127.0.0.1:1883"
     assert found["database"] == f"sqlite:///{machine.parent / 'abbe.sqlite3'}"
 
 
 def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
-    assert abbe.fails("check-config", "none.toml").startswith("error CFG-001: machine file none.toml does not exist")
+    assert abbe.fails("check-config", "-m", "none.toml").startswith("error CFG-001: machine file none.toml does not exist")
     machine.write_text(MACHINE_FILE.replace("chain", "chian"), encoding="utf-8")
-    assert "did you mean 'chain'?" in abbe.fails("check-config", machine)
+    assert "did you mean 'chain'?" in abbe.fails("check-config", "-m", machine)
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
         (["chek-config"], "error USE-001: No such command 'chek-config'. Did you mean 'check-config'?"),
-        (["check-config"], "error USE-001: Missing argument 'FILE'"),
+        (["check-config"], "error CFG-001: no machine is named - give -m FILE"),
         (["runs", "--dp", "x"], "error USE-001: No such option: --dp"),
-        (["runs"], "error STO-001: there is no database abbe.sqlite3 - give --db URL"),
+        (["runs"], "error STO-001: there is no database abbe.sqlite3 - give -m FILE or --db URL"),
         (["runs", "--db", "nonsense"], "error STO-001: database URL 'nonsense' cannot be understood"),
-        (["runs", "--db", "sqlite://", "--machine", "m.toml"], "error CFG-001: --db and --machine both name a database"),
+        (["runs", "--db", "sqlite://", "--machine", "m.toml"], "error CFG-001: --db and -m both name a database"),
         (["runs", "--machine", "m.toml"], "error CFG-001: machine file m.toml does not exist"),
         (["runs", "--db", "postgresql://me:topsecret@127.0.0.1:1/x"], "me:***@127.0.0.1:1/x"),
         (["show", "r01", "--db", "sqlite://"], "error STO-002: no run 'r01' in sqlite://"),
@@ -125,7 +125,7 @@ def test_bad_input_is_one_line(abbe: Abbe, arguments: list[str], message: str) -
 
 
 def test_without_a_certificate_nothing_is_measured_for_a_table(abbe: Abbe, machine: Path) -> None:
-    said = abbe.fails("correct", machine, "june")
+    said = abbe.fails("correct", "-m", machine, "june")
     assert "certificate" in said
     assert "[calibration]" in said
 
@@ -257,7 +257,7 @@ def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsy
         raise error
 
     monkeypatch.setattr(module, "app", fails)
-    assert cli.run(["check-config", "x"]) == 2
+    assert cli.run(["check-config", "-m", "x"]) == 2
     assert capsys.readouterr().err == (
         "error ILK-003: the door is open - close it; cup and bar may still be mounted: take them out before anything moves\n"
     )
@@ -271,11 +271,11 @@ def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsy
     ],
 )
 def test_a_helix_that_is_none_is_one_line(abbe: Abbe, machine: Path, helix: str) -> None:
-    said = abbe.fails("measure", machine, "--helix", helix, "--dry-run")
+    said = abbe.fails("measure", "-m", machine, "--helix", helix, "--dry-run")
     assert said.startswith("error CFG-001: ")
 
 
-COMMANDS = ("effects backlash", "effects", "--help", "comp formats", "check-config machine.toml", "import µ→")
+COMMANDS = ("effects backlash", "effects", "--help", "comp formats", "check-config -m machine.toml", "import µ→")
 
 
 def judge_letters(words: str, place: str, out: bytes, err: bytes, code: int | None) -> None:

@@ -276,15 +276,15 @@ async def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     machine, url = tmp_path / "machine.toml", f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
     machine.write_text(FILE)
     with Store.open(url) as store:
-        assert run(["alarm", "list", str(machine)]) == 0
+        assert run(["alarm", "list", "-m", str(machine)]) == 0
         assert "no alarm of mill-7 is open" in capsys.readouterr().out
         await Bench(store, url).check(result(0, 25.0))
-    assert run(["alarm", "acknowledge", str(machine), "1", "--as", "otto"]) == 0
+    assert run(["alarm", "acknowledge", "-m", str(machine), "1", "--as", "otto"]) == 0
     assert "alarm 1 is acknowledged: seen by otto" in capsys.readouterr().out
-    assert run(["alarm", "acknowledge", str(machine), "1"]) == 2
+    assert run(["alarm", "acknowledge", "-m", str(machine), "1"]) == 2
     assert "was acknowledged by otto" in capsys.readouterr().err
-    assert run(["alarm", "acknowledge", str(machine), "9"]) == 2
+    assert run(["alarm", "acknowledge", "-m", str(machine), "9"]) == 2
     assert "mill-7 has no alarm 9 - abbe alarm list shows those there are" in capsys.readouterr().err
-    assert run(["alarm", "list", str(machine), "--json"]) == 0
+    assert run(["alarm", "list", "-m", str(machine), "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]
     assert (doc["alarm"], doc["state"], doc["signals"][0]["expanded"]) == (1, "acknowledged", 1.0)

@@ -53,7 +53,7 @@ def machine(tmp_path: Path) -> Path:
 
 
 def test_the_drift_is_told_with_its_days(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["trend", str(machine), "--json"]) == 0
+    assert run(["trend", "-m", str(machine), "--json"]) == 0
     doc = json.loads(capsys.readouterr().out)
     diagonal, helix = doc["figures"]
     assert (diagonal["figure"], diagonal["checks"], diagonal["state"], diagonal["direction"]) == ("body_diagonal_um", 60, "drifting", 1)
@@ -68,20 +68,20 @@ def test_the_drift_is_told_with_its_days(machine: Path, capsys: pytest.CaptureFi
 
 
 def test_the_table_and_a_new_series(machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["trend", str(machine)]) == 0
+    assert run(["trend", "-m", str(machine)]) == 0
     out = capsys.readouterr().out
     assert "drifting up" in out
     assert "not known: the slope is not significant" in out
-    assert run(["trend", str(machine), "--after", "2026-04-26T12:00:00Z"]) == 0
+    assert run(["trend", "-m", str(machine), "--after", "2026-04-26T12:00:00Z"]) == 0
     assert "too few checks" in capsys.readouterr().out
 
 
 def test_nothing_to_tell_and_bad_input(tmp_path: Path, machine: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    assert run(["trend", str(machine), "--after", "yesterday"]) == 2
+    assert run(["trend", "-m", str(machine), "--after", "yesterday"]) == 2
     assert "error CFG-001: --after 'yesterday' is not a date" in capsys.readouterr().err
-    assert run(["trend", str(machine), "--after", "2027-01-01"]) == 0
+    assert run(["trend", "-m", str(machine), "--after", "2027-01-01"]) == 0
     assert "no check of mill-7 has figures yet" in capsys.readouterr().out
     (tmp_path / "abbe.sqlite3").unlink()
-    assert run(["trend", str(machine)]) == 2
+    assert run(["trend", "-m", str(machine)]) == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert not (tmp_path / "abbe.sqlite3").exists()

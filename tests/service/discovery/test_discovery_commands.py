@@ -144,21 +144,21 @@ def test_the_book_is_used_compared_and_taken_back(abbe: Call, finds: Callable[[S
     assert no_table_lines(book)[0].startswith("backlash (lost motion) X (model version 1) needs a parameter of the control, not tables: ")
     finds(Search(width_um=2.0))
     assert "model version 2" in abbe("discover", july, "--db", DB)[1]
-    out = abbe("model", "diff", "VMC-1", 1, "--db", DB)[1]
+    out = abbe("model", "diff", "--of", "VMC-1", 1, "--db", DB)[1]
     assert "backlash:X changed 8.00 ± 0.20 10.00 ± 0.28 µm" in out
     finds(Search(width_um=-9.95))  # somebody mended it
     assert "model version 3" in abbe("discover", write_case(tmp_path / "august", campaign="august", width_mm=5e-5), "--db", DB)[1]
-    out = abbe("model", "show", "VMC-1", "--db", DB)[1]
+    out = abbe("model", "show", "--of", "VMC-1", "--db", DB)[1]
     assert "no longer there: backlash:X" in out
-    assert abbe("model", "revert", "VMC-1", 1, "--db", DB)[1] == "machine VMC-1: version 4 is current; it equals version 1"
-    listed = json.loads(abbe("model", "list", "VMC-1", "--db", DB, "--json")[1])
+    assert abbe("model", "revert", "--of", "VMC-1", 1, "--db", DB)[1] == "machine VMC-1: version 4 is current; it equals version 1"
+    listed = json.loads(abbe("model", "list", "--of", "VMC-1", "--db", DB, "--json")[1])
     assert [(m["version"], [e["label"] for e in m["effects"]]) for m in listed] == [
         (1, ["backlash:X"]),
         (2, ["backlash:X", "backlash:X"]),
         (3, []),
         (4, ["backlash:X"]),
     ]
-    assert "hold the same effects" in abbe("model", "diff", "VMC-1", 1, 4, "--db", DB)[1]
+    assert "hold the same effects" in abbe("model", "diff", "--of", "VMC-1", 1, 4, "--db", DB)[1]
 
 
 def test_tables_are_made_without_what_they_cannot_take_out(abbe: Call, finds: Callable[[Search], Search], tmp_path: Path) -> None:
@@ -204,8 +204,8 @@ def test_a_model_of_another_geometry_is_not_used(abbe: Call, finds: Callable[[Se
         (("discover", "nowhere"), "error STO-001: nowhere is neither a folder with campaign.json nor a campaign"),
         (("simulate", "nowhere"), "error STO-001: nowhere is neither a folder with campaign.json nor a campaign"),
         (("effects", "backlsh"), "error DIS-002: the catalogue has no effect 'backlsh' - did you mean backlash"),
-        (("model", "show", "M", "--db", "sqlite://"), "error DIS-001: machine 'M' has no version 0: it has no model"),
-        (("model", "revert", "M", "3", "--db", "sqlite://"), "error DIS-001: machine 'M' has no version 3"),
+        (("model", "show", "--of", "M", "--db", "sqlite://"), "error DIS-001: machine 'M' has no version 0: it has no model"),
+        (("model", "revert", "--of", "M", "3", "--db", "sqlite://"), "error DIS-001: machine 'M' has no version 3"),
     ],
 )
 def test_bad_input_is_one_line(abbe: Call, words: tuple[str, ...], line: str) -> None:

@@ -79,12 +79,12 @@ def test_dask_gives_the_same_numbers(url: str, here: list[ReanalysisResult], req
 
 
 def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[ReanalysisResult]) -> None:
-    assert run(["solve-all", "june-*", "--model", "rigid6", "--store", url]) == 1  # one was refused
+    assert run(["solve-all", "june-*", "--model", "rigid6", "--db", url]) == 1  # one was refused
     out = capsys.readouterr().out
     assert [word in out for word in ("june-7", "june-8", "june-empty", "refused")] == [True] * 4
     with Store.open(url) as store:
         before = len(store.solutions.all())
-    assert run(["solve-all", "june-8", "--model", "rigid6", "--store", url, "--keep", "--json"]) == 0
+    assert run(["solve-all", "june-8", "--model", "rigid6", "--db", url, "--keep", "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)
     with Store.open(url) as store:
         assert len(store.solutions.all()) == before + 1
@@ -94,9 +94,9 @@ def test_the_command(url: str, capsys: pytest.CaptureFixture[str], here: list[Re
 
 def test_bad_input_is_one_line(url: str, capsys: pytest.CaptureFixture[str]) -> None:
     for words, told in (
-        (["solve-all", "july-*", "--store", url], "error STO-002: no campaign matches 'july-*'"),
+        (["solve-all", "july-*", "--db", url], "error STO-002: no campaign matches 'july-*'"),
         (
-            ["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--store", url],
+            ["solve-all", "--workers", "2", "--dask", "tcp://127.0.0.1:1", "--db", url],
             "error CFG-001: --workers and --dask exclude",
         ),
     ):

@@ -102,11 +102,11 @@ def test_the_list_of_a_history(url: str, capsys: pytest.CaptureFixture[str]) -> 
     assert low < true_days < high
     assert low < days < high
     assert (new.state, new.verdict, new.figures, row(new)[-1]) == ("waiting", "", (), "")
-    assert run(["fleet", "--store", url]) == 0
+    assert run(["fleet", "--db", url]) == 0
     out = capsys.readouterr().out
     assert [heading in out for heading in HEADINGS] == [True] * len(HEADINGS)
     assert [name in out for name in ("mill-1", "mill-2", "mill-3", "new-4")] == [True] * 4
-    assert run(["fleet", "--store", url, "--json"]) == 0
+    assert run(["fleet", "--db", url, "--json"]) == 0
     doc = json.loads(capsys.readouterr().out)
     assert [m["state"] for m in doc["machines"]] == ["waiting", "measuring", "no service", "waiting"]
     assert doc["machines"][2]["days_until_limit"] == pytest.approx(days, rel=1e-6)
@@ -144,11 +144,11 @@ def test_a_service_that_is_gone_or_silent_is_not_running() -> None:
 
 def test_no_database_and_an_empty_one(tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
-    assert run(["fleet", "--store", "sqlite:///none.sqlite3"]) == 2
+    assert run(["fleet", "--db", "sqlite:///none.sqlite3"]) == 2
     assert capsys.readouterr().err.startswith("error STO-001: there is no database none.sqlite3")
     assert not (tmp_path / "none.sqlite3").exists()
     Store.open("sqlite:///new.sqlite3").close()
-    assert run(["fleet", "--store", "sqlite:///new.sqlite3"]) == 0
+    assert run(["fleet", "--db", "sqlite:///new.sqlite3"]) == 0
     assert "no machine is in this database yet" in capsys.readouterr().out
 
 

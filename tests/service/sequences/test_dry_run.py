@@ -53,7 +53,7 @@ def folder(tmp_path):
 
 
 def measure(folder, *words):
-    return CliRunner().invoke(app, ["measure", str(folder / "m.toml"), "--recipe", str(folder / "r.toml"), *words])
+    return CliRunner().invoke(app, ["measure", "-m", str(folder / "m.toml"), "--recipe", str(folder / "r.toml"), *words])
 
 
 def test_a_dry_run_says_duration_strokes_speed_and_readings_and_draws_three_views(folder):
@@ -164,7 +164,7 @@ def test_numbers_are_never_cut_and_names_fold(folder, columns):
         found = measure(folder, "--dry-run").stdout
         assert label in found
     else:
-        found = on_a_terminal(columns, ["measure", str(machine), "--recipe", str(folder / "r.toml"), "--dry-run"])
+        found = on_a_terminal(columns, ["measure", "-m", str(machine), "--recipe", str(folder / "r.toml"), "--dry-run"])
     numbers = " ".join(re.findall(r"\S*\.\.\S*", found))
     assert numbers == "149..450 100..400 -11800..-11650 7..592 250..250 -11992..-11557"
     assert "…" not in found

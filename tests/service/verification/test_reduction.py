@@ -191,7 +191,7 @@ def test_a_coefficient_in_other_units_or_without_uncertainty_is_one_line(tmp_pat
         ("temperature_c = 24.0", "temperature_c = 75.2", "material.temperature_c: expected "),
     ):
         machine.write_text(MACHINE.replace(old, new, 1), encoding="utf-8")
-        assert run(["check-config", str(machine)]) == 2
+        assert run(["check-config", "-m", str(machine)]) == 2
         told = capsys.readouterr().err.strip()
         assert says in told
         assert len(told.splitlines()) <= 2

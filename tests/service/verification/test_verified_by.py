@@ -286,11 +286,11 @@ def test_the_commands_say_it(world: World, tmp_path: Path, capsys: pytest.Captur
     assert run(["fleet", "--db", world.url, "--json"]) == 0
     (line,) = json.loads(capsys.readouterr().out)["machines"]
     assert (line["verdict"], line["verified"]["why"], line["figures"]) == ("unverified", "rollback", [])
-    assert run(["trend", str(file)]) == 0
+    assert run(["trend", "-m", str(file)]) == 0
     said = capsys.readouterr().out
     assert said.startswith("unverified since the rollback of ")
-    assert f"abbe measure {file} --recipe quick-check" in said
-    assert run(["trend", str(file), "--json"]) == 0
+    assert f"abbe measure -m {file} --recipe quick-check" in said
+    assert run(["trend", "-m", str(file), "--json"]) == 0
     assert json.loads(capsys.readouterr().out)["verified"]["state"] == "unverified"
 
 
