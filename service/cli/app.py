@@ -15,9 +15,10 @@ from abbe.service.cli.measure import correct, listen, measure
 from abbe.service.cli.plan import plan
 from abbe.service.cli.reference import papers, vectors
 from abbe.service.cli.results.discover import discover
+from abbe.service.cli.results.import_files import import_files
 from abbe.service.cli.results.model import effects, model
 from abbe.service.cli.results.report import report
-from abbe.service.cli.results.show import export_campaign, import_campaign, runs, show
+from abbe.service.cli.results.show import export_campaign, runs, show
 from abbe.service.cli.results.simulate import errors, simulate
 from abbe.service.cli.results.solve import solve, solve_all
 from abbe.service.cli.tables.comp import comp
@@ -69,7 +70,7 @@ app.command("check-config")(check_config)
 app.command("runs")(runs)
 app.command("show")(show)
 app.command("export")(export_campaign)
-app.command("import")(import_campaign)
+app.command("import")(import_files)
 app.command("vectors")(vectors)
 app.command("papers")(papers)
 app.command("schema")(schema)

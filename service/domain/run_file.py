@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
+from abbe.service.domain.imported_file import Origin, OtherReadings, StatedFigure
 from abbe.service.domain.machine import FileObject, Interval, MachineObject, Point
 
 RUN_FORMAT = "abbe-run/1"
@@ -136,6 +137,9 @@ class CampaignFile(FileObject):
     setups: dict[str, CampaignSetup]
     temperature_sensors: bool
     runs: list[RunEntry]
+    origins: list[Origin] = Field(default_factory=list)
+    readings: list[OtherReadings] = Field(default_factory=list)
+    stated: list[StatedFigure] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _all_differ(self) -> Self:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import math
 import re
 from collections.abc import Iterator
@@ -11,32 +12,33 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.machine import Machine
-from abbe.service.errors import TableFileError
+from abbe.service.errors import AbbeError, TableFileError
 
-NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?")
+NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eE][+-]?\d+)?", re.ASCII)
 
 
 @dataclass(frozen=True, slots=True)
 class TextFile:
-    """One file of a format: its name (no folder) and its text."""
+    """One file of a format: its name (no folder), its text, and the class of its errors."""
 
     name: str
     text: str
+    error: type[AbbeError] = TableFileError
 
     def lines(self) -> Iterator[tuple[int, str]]:
-        """Return the lines with their numbers, from 1."""
-        return enumerate(self.text.splitlines(), start=1)
+        """Return the lines with their numbers, from 1; they end with LF, CRLF or CR."""
+        return enumerate((text.removesuffix("\n") for text in io.StringIO(self.text, newline=None)), start=1)
 
-    def wrong(self, line: int, what: str, remedy: str = "correct the file; nothing was loaded") -> TableFileError:
+    def wrong(self, line: int, what: str, remedy: str = "correct the file; nothing was loaded") -> AbbeError:
         """Return an error about one line of this file, for the caller to raise."""
-        return TableFileError(f"{self.name}:{line}: {what}", remedy)
+        return self.error(f"{self.name}:{line}: {what}", remedy)
 
     def number(self, line: int, word: str, what: str) -> float:
         """Convert ``word`` to a finite number; ``what`` names it in the message.
 
         Raises
         ------
-        TableFileError
+        AbbeError
             The word is not a finite number; the message has file and line.
         """
         if NUMBER.fullmatch(word) is None or not math.isfinite(float(word)):

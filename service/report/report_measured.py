@@ -29,6 +29,7 @@ from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import about_axis, not_judged, path_axis
 from abbe.service.runs.observations import run_data
+from abbe.service.verification.imported_report import evaluate_imported
 from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures
 
@@ -69,6 +70,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
     """Report of a campaign: figures by ISO 230, figures of a verification, the solution."""
     campaign = found.campaign
     evaluated = evaluate(campaign.runs, campaign.doc.get("instruments"), rules.materials)
+    evaluated.add(evaluate_imported(campaign.doc))
     checked, verdict = _verification(campaign.runs, rules)
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)

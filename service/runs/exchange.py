@@ -125,7 +125,17 @@ def import_folder(store: Store, folder: Path) -> int:
     StoreError
         The store already has a campaign of this name.
     """
-    content = read_folder(folder)
+    return store_folder(store, read_folder(folder))
+
+
+def store_folder(store: Store, content: Folder) -> int:
+    """Store a checked campaign, completely or not at all, and return its id.
+
+    Raises
+    ------
+    StoreError
+        The store already has a campaign of this name.
+    """
     campaign, machine = content.campaign, content.campaign["machine"]
     imported = [_imported(*one) for one in zip(campaign["runs"], content.run_files, content.runs, strict=True)]
     doc = {"imported": campaign, "errors": content.errors}

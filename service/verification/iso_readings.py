@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -126,8 +126,18 @@ def _approaches(name: str, group: list[Run]) -> Approaches:
         position, sign, value = _readings(run, name)
         for p, s, v in zip(position, sign, value, strict=True):
             cells.setdefault((float(p), int(s)), []).append(float(v))
-    turns = {p for run in group for p in _turning_points(run, name)}
-    places = sorted({p for p, s in cells if (p, -s) in cells} - turns)
+    return approaches_of(cells, {p for run in group for p in _turning_points(run, name)})
+
+
+def approaches_of(cells: Mapping[tuple[float, int], list[float]], turns: Collection[float] = ()) -> Approaches:
+    """Readings by position and direction as a test: positions that were approached from both sides, without turning points.
+
+    Raises
+    ------
+    ValueError
+        They are fewer than two.
+    """
+    places = sorted({p for p, s in cells if (p, -s) in cells} - set(turns))
     cycles = max((len(cells[p, s]) for p in places for s in (1, -1)), default=0)
     sides = [np.array([cells[p, s] + [np.nan] * (cycles - len(cells[p, s])) for p in places]) for s in (1, -1)]
     return Approaches(np.array(places), *sides)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import groupby
 from typing import Any
 
@@ -29,8 +29,8 @@ from abbe.service.verification.reduction import AT_20, REDUCTION_STATEMENT, Redu
 UM = 1e3
 POLAR_POINTS = 720
 LASER_STATEMENT = (
-    "U of ISO 230-2 and 230-6 figures includes the scatter of the cycles, as far as repeats show it, the wavelength ({wave:g} µm/m), the "
-    "temperature of the scales ({kelvin:g} K at {expansion:g} µm/m/K, or as stated for a reduced test) and the resolution, propagated "
+    "U of ISO 230-2 and 230-6 figures includes the scatter of the cycles, as far as repeats show it, the wavelength ({wave:.2g} µm/m), the "
+    "temperature of the scales ({kelvin:.2g} K at {expansion:g} µm/m/K, or as stated for a reduced test) and the resolution, propagated "
     "through the figure's own formula (idea of ISO/TR 230-9). Deviations are as measured, except in groups that say at 20 °C. Where there "
     "is one cycle, the scatter is that of the reversals about their mean."
 )
@@ -54,6 +54,12 @@ class Evaluated:
     statements: list[str] = field(default_factory=list)
     conditions: dict[str, str] = field(default_factory=dict)
 
+    def add(self, other: Evaluated) -> None:
+        """Append the results of ``other``."""
+        for one in ("figures", "pictures", "remarks", "not_observable", "statements"):
+            getattr(self, one).extend(getattr(other, one))
+        self.conditions.update(other.conditions)
+
 
 def evaluate(
     runs: Sequence[Run], instruments: dict[str, Any] | None = None, materials: Mapping[str, AxisMaterial] | None = None
@@ -70,6 +76,7 @@ def evaluate(
         Expansion of the scales by axis, from the machine file; without it nothing is reduced to 20 °C.
     """
     out = Evaluated()
+    known = laser_inputs(instruments or {})
     budget = scale_budget(instruments or {})
     refused = [f"run {run.run_id}: {why}" for run in runs if (why := not_judged(run))]
     runs = [run for run in runs if not not_judged(run)]
@@ -77,11 +84,10 @@ def evaluate(
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
     for test in linear:
         its_runs = [run for run in runs if run.run_id in test.runs]
-        _axis(out, test, budget, reduction_of(its_runs, test.name, materials or {}))
+        _axis(out, test, (budget, known), reduction_of(its_runs, test.name, materials or {}))
     for plane, tests in along.items():
         _diagonals(out, plane, tests, budget)
     if linear or along:
-        known = StatedInputs()
         numbers = {"wave": known.u_wavelength * 1e6, "kelvin": known.u_scale_temperature_k, "expansion": known.scale_expansion_per_k * 1e6}
         out.statements.append(LASER_STATEMENT.format(**numbers))
     if circles:
@@ -90,14 +96,21 @@ def evaluate(
     return out
 
 
+def laser_inputs(instruments: dict[str, Any]) -> StatedInputs:
+    """Stated inputs of a laser: the defaults, or what the campaign file widens because it is unknown."""
+    laser, usual = instruments.get("laser") or {}, StatedInputs()
+    wave, kelvin = laser.get("u_wavelength", usual.u_wavelength), laser.get("u_scale_temperature_k", usual.u_scale_temperature_k)
+    return replace(usual, u_wavelength=float(wave), u_scale_temperature_k=float(kelvin))
+
+
 def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
     """Uncertainty that repeats do not show, from the budget's stated inputs and the instrument's resolution."""
-    known = StatedInputs()
+    known = laser_inputs(instruments)
     scale = float(np.hypot(known.u_wavelength, known.u_scale_temperature_k * known.scale_expansion_per_k))
     return ScaleBudget(scale, float((instruments.get("laser") or {}).get("resolution_mm", 0.0)) / np.sqrt(12.0))
 
 
-def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduction) -> None:
+def _axis(out: Evaluated, test: AxisTest, budget: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> None:
     found = _as_measured_and_at_20(out, test, budget, reduction)
     runs = ", ".join(test.runs)
     if found.lowest != found.most:
@@ -107,28 +120,30 @@ def _axis(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduct
         out.not_observable.append(f"repeatability and accuracy of axis {test.name}: every position was approached once from each side")
 
 
-def _as_measured_and_at_20(out: Evaluated, test: AxisTest, budget: ScaleBudget, reduction: Reduction) -> Positioning:
+def _as_measured_and_at_20(out: Evaluated, test: AxisTest, stated: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> Positioning:
     """Add the figures as measured and, where the temperature is known, those at 20 °C before them; return those as measured."""
+    budget, known = stated
     group, label, x_label = f"Axis {test.name}, set-up {test.setup}", f"{test.name} {test.setup}", f"position of {test.name} in mm"
     out.conditions[f"{AT_20}, axis {label}"] = reduction.text
     if reduction.expansion is None or reduction.temperature is None:
         found = positioning(test.readings, budget)
-        out.figures += [_figure(f"{group}: positioning, ISO 230-2", *row, "ISO 230-2") for row in _rows(found)]
+        out.figures += [_figure(f"{group}: positioning, ISO 230-2", *row, "ISO 230-2") for row in positioning_rows(found)]
         out.pictures.append(_positioning(label, x_label, found))
         out.remarks.append(f"axis {test.name} ({', '.join(test.runs)}): {reduction.text}")
         return found
-    measured, at_20 = budgets(budget, reduction.expansion, StatedInputs().u_wavelength)
+    measured, at_20 = budgets(budget, reduction.expansion, known.u_wavelength)
     found, result = positioning(test.readings, measured), positioning(reduced(test.readings, reduction.expansion), at_20)
-    out.figures += [_figure(f"{group}: positioning at 20 °C, ISO 230-2", *row, "ISO 230-2, at 20 °C") for row in _rows(result)]
+    out.figures += [_figure(f"{group}: positioning at 20 °C, ISO 230-2", *row, "ISO 230-2, at 20 °C") for row in positioning_rows(result)]
     as_read = f"{group}: positioning as measured at {reduction.temperature.text}"
-    out.figures += [_figure(as_read, *row, "ISO 230-2, as measured") for row in _rows(found)]
+    out.figures += [_figure(as_read, *row, "ISO 230-2, as measured") for row in positioning_rows(found)]
     out.pictures += [_positioning(f"{label} at 20 °C", x_label, result), _positioning(f"{label} as measured", x_label, found)]
     if REDUCTION_STATEMENT not in out.statements:
         out.statements.append(REDUCTION_STATEMENT)
     return found
 
 
-def _rows(p: Positioning) -> list[tuple[str, str, Value | None]]:
+def positioning_rows(p: Positioning) -> list[tuple[str, str, Value | None]]:
+    """Symbol, name and value of every figure of a test in both directions."""
     return [
         ("A", "accuracy of positioning, both directions", p.A),
         ("A+", "accuracy of positioning, moving in +", p.A_forward),

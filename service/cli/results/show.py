@@ -1,4 +1,4 @@
-"""`abbe runs`, `show`, `export` and `import`: campaigns and runs of a database."""
+"""`abbe runs`, `show` and `export`: campaigns and runs of a database."""
 
 from __future__ import annotations
 
@@ -164,17 +164,3 @@ def export_campaign(
         written = export_folder(store, campaign, folder, images_of(store))
         count = len(store.runs.all(store.campaigns.find(campaign).id))
     typer.echo(f"exported campaign {campaign!r} with {count} runs to {written}")
-
-
-def import_campaign(
-    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder with campaign.json.", show_default=False)],
-    db: DbOption = None,
-    machine: MachineOption = None,
-) -> None:
-    """Check a campaign folder and store it: all of it or, after any mistake, nothing."""
-    from abbe.service.runs.exchange import import_folder, read_folder
-
-    read_folder(folder)  # before a database is created
-    with open_store(database_url(db, machine), must_exist=False) as store:
-        record = store.campaigns.find(import_folder(store, folder))
-        typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")

@@ -1,0 +1,121 @@
+"""``abbe import``: a campaign folder, or files of instruments after a preview."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store, print_table
+
+if TYPE_CHECKING:
+    from collections.abc import Sequence
+
+    from abbe.service.instrument_files.answers import Answers, Question
+    from abbe.service.instrument_files.campaign import Made
+    from abbe.service.instrument_files.content import Content
+
+NOT_STORED = 1
+
+
+def import_files(  # noqa: PLR0913 - one argument for each option
+    files: Annotated[
+        list[Path], typer.Argument(metavar="FILE...|DIR", help="Files of one machine, or a folder with campaign.json.", show_default=False)
+    ],
+    yes: Annotated[bool, typer.Option("--yes", help="Store the files without asking.")] = False,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name of the campaign. Default: that of the first file.", show_default=False)
+    ] = None,
+    axis: Annotated[str | None, typer.Option("--axis", help="X, Y or Z, for a file that does not say it.", show_default=False)] = None,
+    unit: Annotated[str | None, typer.Option("--unit", help="Of the readings, for such a file: mm, um ...", show_default=False)] = None,
+    sign: Annotated[
+        str | None, typer.Option("--sign", help="measured-nominal or nominal-measured, for such a file.", show_default=False)
+    ] = None,
+    at_mm: Annotated[float | None, typer.Option("--at", help="Where the axis stood during a trace, mm.", show_default=False)] = None,
+    scale_c: Annotated[
+        float | None, typer.Option("--scale-temperature", help="Of the measured axis' scale, degrees C.", show_default=False)
+    ] = None,
+    air_c: Annotated[float | None, typer.Option("--air-temperature", help="Degrees C.", show_default=False)] = None,
+    pressure_hpa: Annotated[float | None, typer.Option("--air-pressure", help="hPa.", show_default=False)] = None,
+    feed_mm_min: Annotated[float | None, typer.Option("--feed", help="Between the targets, mm/min.", show_default=False)] = None,
+    db: DbOption = None,
+    machine: MachineOption = None,
+) -> None:
+    """Import a campaign folder, or files of instruments as one campaign after a preview: all of it or, after any mistake, nothing.
+
+    Files: .rtl, .rta. What they do not say is asked, or stays unknown and widens U. Temperatures of the options count for files that
+    state none. --machine FILE: the machine with its chain and strokes, and its database. Without a terminal and without --yes the preview
+    is printed, nothing is stored, and the exit code is 1.
+    """
+    from abbe.service.instrument_files.answers import Answers
+
+    if len(files) == 1 and (files[0].is_dir() or not files[0].suffix):
+        _import_folder(files[0], db, machine)
+        return
+    answers = Answers(
+        axis=axis, unit=unit, sign=sign, at_mm=at_mm, scale_c=scale_c, air_c=air_c, pressure_hpa=pressure_hpa, feed_mm_min=feed_mm_min
+    )
+    _import_files(files, answers, name or files[0].stem, (db, machine), yes=yes)
+
+
+def _import_folder(folder: Path, db: str | None, machine: Path | None) -> None:
+    from abbe.service.runs.exchange import import_folder, read_folder
+
+    read_folder(folder)  # before a database is created
+    with open_store(database_url(db, machine), must_exist=False) as store:
+        record = store.campaigns.find(import_folder(store, folder))
+        typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")
+
+
+def _import_files(files: list[Path], answers: Answers, name: str, where: tuple[str | None, Path | None], *, yes: bool) -> None:
+    from abbe.service.config import load_machine
+    from abbe.service.instrument_files.answers import checked
+    from abbe.service.instrument_files.campaign import campaign_of
+    from abbe.service.instrument_files.registry import read_file
+    from abbe.service.runs.exchange import store_folder
+    from abbe.service.site import site_of
+
+    db, machine = where
+    site = None if machine is None else site_of(load_machine(machine).machine)
+    contents = [read_file(path) for path in files]
+    answers = _asked(contents, checked(answers))
+    made = campaign_of(contents, answers, name, None if site is None else site.doc)
+    _preview(contents, answers, made)
+    if not yes and not (sys.stdin.isatty() and typer.confirm("Store this campaign?")):
+        typer.echo("nothing was stored" + ("" if sys.stdin.isatty() else ": --yes stores it"))
+        raise typer.Exit(NOT_STORED)
+    with open_store(database_url(db, machine), must_exist=False) as store:
+        record = store.campaigns.find(store_folder(store, made.folder))
+        typer.echo(f"imported campaign {record.name!r} with {len(made.folder.runs)} runs into {store.url}")
+        typer.echo(f"`abbe report {record.name}` evaluates it")
+
+
+def _asked(contents: Sequence[Content], answers: Answers) -> Answers:
+    """Answers completed at the terminal; unchanged without one."""
+    from dataclasses import replace
+
+    from abbe.service.instrument_files.answers import checked, open_questions
+
+    if not sys.stdin.isatty():
+        return answers
+    for content in contents:
+        while questions := open_questions(content, answers):
+            answers = checked(replace(answers, **{questions[0].key: _answer(content.name, questions[0])}))
+    return answers
+
+
+def _answer(name: str, question: Question) -> Any:
+    from click import Choice
+
+    text = f"{name} does not say {question.text}"
+    return typer.prompt(text, type=Choice(question.choices) if question.choices else float)
+
+
+def _preview(contents: Sequence[Content], answers: Answers, made: Made) -> None:
+    from abbe.service.instrument_files.answers import settled
+    from abbe.service.instrument_files.preview import preview_rows
+
+    for content, origin in zip(contents, made.origins, strict=True):
+        print_table(("what", "value"), preview_rows(content, settled(content, answers), origin))

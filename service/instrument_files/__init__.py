@@ -1,0 +1,1 @@
+"""Files of instruments and tables of other programs: read strictly, previewed, and stored as campaigns."""
