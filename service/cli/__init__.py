@@ -11,13 +11,22 @@ import sys
 from collections.abc import Sequence
 
 BAD_INPUT = 2
+EXIT_CODES = {
+    0: "done; the answer is yes",
+    1: "done; the answer is no: out of limits, not kept, not proved, refused by a rule, an audit that was changed",
+    2: "bad input or a fault: one line with a code says what, where, and what to do; nothing was lost",
+    129: "the terminal was closed (SIGHUP)",
+    130: "Ctrl-C (SIGINT)",
+    143: "ended from outside (SIGTERM)",
+}
+"""Exit codes of every command; docs/reference/cli.md lists them."""
 UNWRITTEN = frozenset((errno.EPIPE, errno.EBADF, errno.ENOSPC, errno.EFBIG, errno.EDQUOT))
 """``errno`` values of a failed write to stdout: reader gone, stdout closed, disk full, and so on."""
 INTERRUPTED = 130
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
-    """Run one command and exit with its code: 0 done, 1 negative answer, 2 bad input or a fault, 130 Ctrl-C.
+    """Run one command and exit with its code (`EXIT_CODES`).
 
     ``arguments``: used instead of those of the command line, by tests.
     """

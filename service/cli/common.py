@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import json
 import os
+import re
+import shlex
 import sys
 from contextlib import contextmanager
 from pathlib import Path
@@ -167,18 +169,53 @@ def print_json(value: Any) -> None:
     sys.stdout.write(visible_json(json.dumps(value, indent=2, ensure_ascii=False)) + "\n")
 
 
+NUMBER = re.compile(r"[-+−±≤≥~<>\d.,:;%/×x() \n]*")
+"""A cell of nothing but numbers: it is never broken."""
+NARROWEST = 8
+"""Least width of a column of words on a narrow terminal."""
+
+
 def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: str | None = None) -> None:
-    """Write a table to stdout; when piped, 400 columns wide, so that rows rarely wrap."""
+    """Write a table to stdout: words fold at a terminal's width, numbers stay whole; into a pipe or file, tabs separate the cells."""
+    from abbe.service.secrets import visible
+
+    # Visible: names and targets come from outside.
+    cells = [["\n".join(map(visible, cell.split("\n"))) for cell in row] for row in rows]
+    if not sys.stdout.isatty():
+        lines = ([title] if title else []) + ["\t".join(cell.replace("\n", "; ") for cell in row) for row in (headings, *cells)]
+        sys.stdout.write("\n".join(lines) + "\n")
+        return
     from rich.box import SIMPLE_HEAD
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
-    from abbe.service.secrets import visible
-
-    console = Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=400)
-    table = Table(*headings, title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
-    for row in rows:
-        # Text: brackets in file names are not markup. Visible: names and targets come from outside.
-        table.add_row(*(Text("\n".join(map(visible, cell.split("\n"))), overflow="fold") for cell in row))
+    table = Table(title=title, box=SIMPLE_HEAD, title_justify="left", pad_edge=False)
+    least = 0
+    for heading, column in zip(headings, zip(*cells, strict=True) if cells else [()] * len(headings), strict=True):
+        width = max((len(line) for cell in (heading, *column) for line in cell.split("\n")), default=0)
+        number = all(map(NUMBER.fullmatch, column))
+        width = width if number else min(NARROWEST, width)
+        table.add_column(heading, no_wrap=number, overflow="fold", min_width=width)
+        least += width + 3  # padding and divider
+    for row in cells:
+        table.add_row(*map(Text, row))  # Text: brackets in file names are not markup
+    console = Console(highlight=False)
+    console.width = max(console.width, least)
     console.print(table)
+
+
+def conclude(then: str, *, machine: Path | None = None, db: str | None = None, verdict: str = "") -> None:
+    """Tell people the verdict and the next command, on stderr: stdout holds the answer alone.
+
+    ``machine`` and ``db``, as they were given, are repeated in the next command.
+    """
+    from abbe.service.secrets import mask_secrets, visible
+
+    named = "" if machine is None else f" -m {shlex.quote(str(machine))}"
+    named += "" if db is None else f" --db {shlex.quote(mask_secrets(db))}"
+    if sys.stderr is None:
+        return
+    sys.stdout.flush()
+    for line in filter(None, (verdict, f"next: {then}{named}")):
+        sys.stderr.write(visible(line) + "\n")

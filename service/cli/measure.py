@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import math
-import sys
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -14,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import MachineOption, machine_file
+from abbe.service.cli.common import MachineOption, machine_file, print_table
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -389,34 +388,15 @@ def print_path(plan: CampaignPlan) -> None:
 
 
 HEADINGS = ("test", "kind", "s", "mm", "X", "Y", "Z", "mm/min", "points")
-NAMES = 2
-"""Number of leading columns that hold names, which wrap; the others hold numbers, which stay whole at any width."""
-NARROWEST = 8
 
 
 def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
     """Print one line per test: time, path, extent, largest speed, readings."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
     rows = [
         (r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *_extent(r), f"{r.fastest_mm_min:.0f}", str(r.readings)) for r in runs
     ]
-    widths = [max(map(len, column)) for column in zip(HEADINGS, *rows, strict=True)]
-    gap = 2
-    least = sum(widths[NAMES:]) + NAMES * NARROWEST + gap * len(HEADINGS)
-    wide = Console().width if sys.stdout.isatty() else sum(widths) + gap * len(HEADINGS)
-    table = Table(box=None, padding=(0, gap, 0, 0), pad_edge=False)
-    for k, (heading, width) in enumerate(zip(HEADINGS, widths, strict=True)):
-        if k < NAMES:
-            table.add_column(heading, overflow="fold", min_width=min(NARROWEST, width))
-        else:
-            table.add_column(heading, justify="right", no_wrap=True, min_width=width)
-    for row in rows:
-        table.add_row(*map(Text, row))
     typer.echo(f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted; X, Y, Z in mm")
-    Console(highlight=False, width=max(wide, least)).print(table)
+    print_table(HEADINGS, rows)
 
 
 def _extent(run: DryRun) -> tuple[str, ...]:

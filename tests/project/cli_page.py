@@ -10,6 +10,7 @@ from typing import Any
 
 import typer
 
+from abbe.service.cli import EXIT_CODES
 from abbe.service.cli.app import app
 from tests.written_page import run
 
@@ -18,21 +19,30 @@ _HEAD = """# Commands
 
 `python -m tests.project.cli_page` writes this page from the command line itself; a test checks that it is current.
 
-Exit codes: 0 done, 1 the answer is no, 2 bad input or a fault (one line with a [code](error-codes.md) says what and what to do),
-129, 130, 143 closed terminal, Ctrl-C, SIGTERM.
+| exit code | |
+|---|---|
+EXIT CODES
+The codes of faults are listed in [error-codes.md](error-codes.md).
 
 `-m FILE` (`--machine FILE`) names the machine file; without it, it is the one that `ABBE_MACHINE` names, else `abbe.toml` in the current
 folder. A command works with the database of the machine file. `--db URL` names a database directly; without a machine it is the one that
-`ABBE_DB` names, else `abbe.sqlite3` in the current folder. `--json`, where `abbe COMMAND --help` lists it, prints JSON on stdout. The
-tables below leave these three out.
+`ABBE_DB` names, else `abbe.sqlite3` in the current folder.
+
+The answer goes to standard output, as JSON with `--json`, and into a file with `--out FILE`; progress and the next command go to standard
+error. A table is folded at a terminal's width; into a pipe it has tabs between its cells. The tables below leave out `-m`, `--db`, `--json`
+and `--out` where they say nothing else.
+
+`abbe --install-completion` makes the shell complete commands and options (bash, zsh, fish, PowerShell).
 """
-_COMMON = ("Print JSON on stdout.", "Machine file. Default:", "Database, instead of")
+_COMMON = ("Print JSON on stdout.", "Machine file. Default:", "Database, instead of", "Write the answer to a file")
 
 
 def page() -> str:
     """The whole page."""
     root = typer.main.get_command(app)
-    return _HEAD + "".join(_section(name, command) for name, command in _commands(root, "abbe"))
+    return _HEAD.replace("EXIT CODES", "".join(f"| {code} | {text} |\n" for code, text in EXIT_CODES.items())) + "".join(
+        _section(name, command) for name, command in _commands(root, "abbe")
+    )
 
 
 def _commands(group: Any, name: str) -> Iterator[tuple[str, Any]]:
