@@ -1,8 +1,7 @@
 """MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for the sequence numbers.
 
-`Agent` implements an MTConnect agent without assets, without the agent as a device, and without XPath (``path``) and streaming
-(``interval``). It observes at each request: it misses changes of a running check between two requests, but no ended check, unless
-more than ten end between two requests.
+`Agent` implements an MTConnect agent without assets, and without XPath (``path``) and streaming (``interval``). It observes at each
+request: it misses changes of a running check between two requests, but no ended check, unless more than ten end between two requests.
 """
 
 from __future__ import annotations
@@ -31,6 +30,13 @@ ITEMS = (
     ("table", "EVENT", "VARIABLE", "DATA_SET"),
     ("system", "CONDITION", "SYSTEM", ""),
 )
+AGENT_ITEMS = (
+    ("agent_avail", "EVENT", "AVAILABILITY", ""),
+    ("added", "EVENT", "DEVICE_ADDED", ""),
+    ("removed", "EVENT", "DEVICE_REMOVED", ""),
+    ("changed", "EVENT", "DEVICE_CHANGED", ""),
+)
+"""The data items of the agent as a device, which MTConnect 1.7 and later demand."""
 _NAMES = {"result": "last_check", "table": "compensation_table"}
 
 
@@ -72,6 +78,8 @@ class Agent:
     def update(self, facts: PlantFacts) -> None:
         """Add observations of everything that has changed."""
         now, job = facts.now_utc, facts.running
+        for item, value in (("agent_avail", "AVAILABLE"), ("added", _uuid(facts)), ("removed", UNAVAILABLE), ("changed", UNAVAILABLE)):
+            self._put(item, now, value)
         self._put("avail", now, "AVAILABLE")
         self._put("exec", now, "ACTIVE" if job else "READY")
         self._put("prog", now, job.recipe if job else UNAVAILABLE)
@@ -103,17 +111,23 @@ class Agent:
 
     def probe(self, facts: PlantFacts) -> bytes:
         """Return the Devices document."""
-        root = _root("MTConnectDevices", self._header(facts.now_utc, assetBufferSize="0", assetCount="0"))
-        name = _clean(facts.machine)
-        device = ET.SubElement(ET.SubElement(root, "Devices"), "Device", id="dev", name=name, uuid=f"abbe-{name}")
-        ET.SubElement(device, "Description", manufacturer="Abbe").text = f"Abbe {facts.version}"
-        items = ET.SubElement(device, "DataItems")
-        for item, category, kind, representation in ITEMS:
+        root = _root(
+            "MTConnectDevices", self._header(facts.now_utc, deviceModelChangeTime=self._changed, assetBufferSize="1", assetCount="0")
+        )
+        devices, version = ET.SubElement(root, "Devices"), f"Abbe {facts.version}"
+        agent = ET.SubElement(devices, "Agent", id="agent", name="Agent", uuid=_agent_uuid(facts), mtconnectVersion=VERSION)
+        device = ET.SubElement(devices, "Device", id="dev", name=_clean(facts.machine), uuid=_uuid(facts))
+        for one, declared in ((agent, AGENT_ITEMS), (device, ITEMS)):
+            ET.SubElement(one, "Description", manufacturer="Abbe").text = version
+            self._declare(ET.SubElement(one, "DataItems"), declared)
+        return _bytes(root)
+
+    def _declare(self, items: ET.Element, declared: tuple[tuple[str, str, str, str], ...]) -> None:
+        for item, category, kind, representation in declared:
             attributes = {"id": item, "category": category, "type": kind}
             attributes |= {"representation": representation} if representation else {}
             attributes |= {"name": _NAMES[item]} if item in _NAMES else {}
             ET.SubElement(items, "DataItem", attributes)
-        return _bytes(root)
 
     def current(self, facts: PlantFacts, query: Mapping[str, str]) -> bytes:
         """Return the Streams document of the current values, or of the values when observation ``at`` was made."""
@@ -148,17 +162,25 @@ class Agent:
 
     def _streams(self, facts: PlantFacts, found: list[Observation], following: int) -> bytes:
         numbers = {"nextSequence": following, "firstSequence": self._first, "lastSequence": self._next - 1}
-        root = _root("MTConnectStreams", self._header(facts.now_utc, **{key: str(value) for key, value in numbers.items()}))
-        name = _clean(facts.machine)
-        device = ET.SubElement(ET.SubElement(root, "Streams"), "DeviceStream", name=name, uuid=f"abbe-{name}")
-        component = ET.SubElement(device, "ComponentStream", component="Device", name=name, componentId="dev")
+        head = {key: str(value) for key, value in numbers.items()} | {"deviceModelChangeTime": self._changed}
+        root = _root("MTConnectStreams", self._header(facts.now_utc, **head))
+        streams, name = ET.SubElement(root, "Streams"), _clean(facts.machine)
+        agent = ET.SubElement(streams, "DeviceStream", name="Agent", uuid=_agent_uuid(facts))
+        device = ET.SubElement(streams, "DeviceStream", name=name, uuid=_uuid(facts))
+        own = {item[0] for item in AGENT_ITEMS}
+        self._observed(ET.SubElement(agent, "ComponentStream", component="Agent", name="Agent", componentId="agent"), found, own)
+        others = {item[0] for item in ITEMS}
+        self._observed(ET.SubElement(device, "ComponentStream", component="Device", name=name, componentId="dev"), found, others)
+        return _bytes(root)
+
+    def _observed(self, component: ET.Element, found: list[Observation], items: set[str]) -> None:
+        in_order = sorted((one for one in found if one.item in items), key=lambda one: one.sequence)
         for group, category in (("Events", "EVENT"), ("Condition", "CONDITION")):
-            of_it = [one for one in sorted(found, key=lambda one: one.sequence) if _item(one.item)[1] == category]
+            of_it = [one for one in in_order if _item(one.item)[1] == category]
             if of_it:
                 parent = ET.SubElement(component, group)
                 for one in of_it:
                     _write(parent, one)
-        return _bytes(root)
 
     def error(self, refused: MtconnectRefusal, now: datetime) -> bytes:
         """Return the Error document of a request that was refused."""
@@ -168,12 +190,23 @@ class Agent:
 
     def _header(self, now: datetime, **more: str) -> dict[str, str]:
         head = {"creationTime": _stamp(now), "sender": "abbe", "instanceId": str(self._instance), "version": VERSION}
-        changed = datetime.fromtimestamp(self._instance, UTC)
-        return head | {"bufferSize": str(self._size), "deviceModelChangeTime": _stamp(changed)} | more
+        return head | {"bufferSize": str(self._size)} | more
+
+    @property
+    def _changed(self) -> str:
+        return _stamp(datetime.fromtimestamp(self._instance, UTC))
+
+
+def _uuid(facts: PlantFacts) -> str:
+    return f"abbe-{_clean(facts.machine)}"
+
+
+def _agent_uuid(facts: PlantFacts) -> str:
+    return f"abbe-agent-{_clean(facts.machine)}"
 
 
 def _item(name: str) -> tuple[str, str, str, str]:
-    return next(item for item in ITEMS if item[0] == name)
+    return next(item for item in (*AGENT_ITEMS, *ITEMS) if item[0] == name)
 
 
 def _write(parent: ET.Element, one: Observation) -> None:
