@@ -28,7 +28,7 @@ from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board, BoardWatch, SnapshotSource, StatePublisher, VerifiedWatch
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns, may, may_measure
+from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns, may
 from abbe.service.core.push_recovery import PushRecovery, push_is_open
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.core.table_watch import TableWatch
@@ -96,7 +96,9 @@ class Service:
         alarms = self._make_alarms(book)
         checks = CheckJobs(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(split_recipe_name(schedule.recipe)[0] for schedule in setup.schedules)]))
-        self._jobs = JobRegistry(checks, recipes, lambda who: asyncio.to_thread(may_measure, store, who), clock, self._changed, watchers)
+        self._jobs = JobRegistry(
+            checks, recipes, lambda who, need: asyncio.to_thread(may, store, who, need), clock, self._changed, watchers
+        )
         context = OrderContext(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, setup.control)
         if setup.campaign is not None:
             self._jobs.full = full_campaigns(

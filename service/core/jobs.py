@@ -26,6 +26,7 @@ from abbe.service.scheduler.job import Job, carry_out
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import split_recipe_name
+from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.jobs")
 
@@ -99,7 +100,7 @@ class JobRegistry:
     recipes : sequence of str
         Recipes that a person may start.
     may : callable
-        ``await may(who)``: whether a user may start and steer measurements, by the current table of users.
+        ``await may(who, need)``: whether a user has a permission, by the current table of users.
     changed : callable
         Called whenever a job begins, changes or ends.
     watchers : sequence of JobWatcher
@@ -110,7 +111,7 @@ class JobRegistry:
         self,
         checks: Callable[[Schedule, datetime], Job[Any]],
         recipes: Sequence[str],
-        may: Callable[[str], Awaitable[bool]],
+        may: Callable[[str, Permission], Awaitable[bool]],
         clock: Clock,
         changed: Callable[[], None],
         watchers: Sequence[JobWatcher] = (),
@@ -269,7 +270,7 @@ class JobRegistry:
 
     async def steer(self, asked: SteerJob) -> Answer:
         """Stop, abort, pause or resume the running job."""
-        entry = await self._asked_of(asked)
+        entry = await self._asked_of(asked, Permission.STOP if asked.how in {"stop", "abort"} else Permission.MEASURE)
         if isinstance(entry, Answer):
             return entry
         control = entry.control
@@ -284,7 +285,7 @@ class JobRegistry:
 
     async def done_by_hand(self, asked: ConfirmPrompt) -> Answer:
         """Confirm that a person has done what the open prompt of a job asks for."""
-        entry = await self._asked_of(asked)
+        entry = await self._asked_of(asked, Permission.MEASURE)
         if isinstance(entry, Answer):
             return entry
         if not entry.control.prompts.answer(asked.prompt):
@@ -293,9 +294,9 @@ class JobRegistry:
         self._changed()
         return _answer(asked.request, "done", "", asked.job)
 
-    async def _asked_of(self, asked: SteerJob | ConfirmPrompt) -> _Entry | Answer:
-        """Return the running job if the user may steer it, else the refusal."""
-        refused = await self._refused(asked.who)
+    async def _asked_of(self, asked: SteerJob | ConfirmPrompt, need: Permission) -> _Entry | Answer:
+        """Return the running job if the user has a permission, else the refusal."""
+        refused = await self._refused(asked.who, need)
         if refused:
             return _answer(asked.request, "forbidden", refused)
         entry = self._jobs.get(asked.job)
@@ -305,8 +306,8 @@ class JobRegistry:
             return _answer(asked.request, "conflict", f"this job has ended: {entry.record.state}", asked.job)
         return entry
 
-    async def _refused(self, who: str) -> str:
-        return "" if await self._may(who) else f"{who} may not measure here"
+    async def _refused(self, who: str, need: Permission = Permission.MEASURE) -> str:
+        return "" if await self._may(who, need) else f"{who} may not {need} here"
 
 
 def _answer(request: int, outcome: Outcome, text: str = "", job: str = "") -> Answer:

@@ -298,8 +298,3 @@ def person(who: str) -> str:
     """Return the user's name in ``user:NAME`` or ``token:NAME/TOKEN``; empty for anything else."""
     kind, _, rest = who.partition(":")
     return rest.partition("/")[0] if kind in {"user", "token"} else ""
-
-
-def may_measure(store: Store, who: str) -> bool:
-    """Return whether a user has the right to measure; ``who`` as in `may`."""
-    return may(store, who, Permission.MEASURE)

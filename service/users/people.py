@@ -218,10 +218,11 @@ class People:
         """End a session."""
         self._store.people.end_session(digest_of(secret))
 
-    def by_session(self, secret: str, *, in_use: bool = True) -> Principal:
+    def by_session(self, secret: str, *, in_use: bool = True, to_stop: bool = False) -> Principal:
         """Owner of a session's secret; `ANONYMOUS` if the session has ended, is idle or too old, or its user is disabled.
 
-        ``in_use`` False: this request does not count as use of the session.
+        ``in_use`` False: this request does not count as use of the session. ``to_stop``: the request stops the machine, which a session
+        that is idle or too old still may.
         """
         digest = digest_of(secret)
         found = self._store.people.session(digest)
@@ -230,9 +231,10 @@ class People:
         session, user = found
         now = self._clock.utc()
         last_used, begun = parse_utc(session.seen_utc), parse_utc(session.created_utc)
-        if session.ended_utc is not None or user.disabled_utc is not None or now - last_used > IDLE or now - begun > LONGEST:
+        over = now - last_used > IDLE or now - begun > LONGEST
+        if session.ended_utc is not None or user.disabled_utc is not None or (over and not to_stop):
             return ANONYMOUS
-        if in_use and now - last_used > TOUCH:
+        if in_use and not over and now - last_used > TOUCH:
             self._store.people.touch_session(session.id)
         role = Role(user.role)
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
@@ -297,6 +299,8 @@ class People:
             return ANONYMOUS
         role = Role(user.role)
         scopes = frozenset(Permission(s) for s in token.scopes)
+        if Permission.MEASURE in scopes:  # whoever may start may stop
+            scopes |= {Permission.STOP}
         return Principal(f"token:{user.name}/{token.name}", role, ALLOWED[role] & scopes, "token")
 
     def has_users(self) -> bool:

@@ -20,6 +20,7 @@ class Permission(StrEnum):
 
     READ = "read"
     MEASURE = "measure"
+    STOP = "stop"
     ACKNOWLEDGE = "acknowledge"
     SOLVE = "solve"
     PROPOSE = "propose"
@@ -29,14 +30,14 @@ class Permission(StrEnum):
     USERS = "users"
 
 
-_OPERATOR = frozenset({Permission.READ, Permission.MEASURE, Permission.ACKNOWLEDGE})
+_OPERATOR = frozenset({Permission.READ, Permission.MEASURE, Permission.STOP, Permission.ACKNOWLEDGE})
 
 ALLOWED: dict[Role, frozenset[Permission]] = {
     Role.VIEWER: frozenset({Permission.READ}),
     Role.OPERATOR: _OPERATOR,
     Role.METROLOGIST: _OPERATOR | {Permission.SOLVE, Permission.PROPOSE},
-    # Approvers judge what others propose: one who also measures and proposes would judge their own work.
-    Role.APPROVER: frozenset({Permission.READ, Permission.ACKNOWLEDGE, Permission.APPROVE, Permission.AUDIT}),
+    # Approvers judge what others propose: one who also measures and proposes would judge their own work. They stop the pushes they order.
+    Role.APPROVER: frozenset({Permission.READ, Permission.STOP, Permission.ACKNOWLEDGE, Permission.APPROVE, Permission.AUDIT}),
     # Manages users and settings. Neither proposes nor approves a table.
     Role.ADMIN: frozenset({Permission.READ, Permission.CONFIGURE, Permission.AUDIT, Permission.USERS}),
 }

@@ -26,6 +26,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.tables import add_table_orders, add_tables
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.document import SecurityHeaders, complete
+from abbe.service.web.error_pages import add_core_unavailable
 from abbe.service.web.frame import FrameMiddleware
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
@@ -42,8 +43,8 @@ from abbe.service.web.pages.plant_screens import add_plant_screens
 from abbe.service.web.pages.proposals import add_table_screen
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.pages.routes import add_pages
-from abbe.service.web.problems import add_core_unavailable
 from abbe.service.web.schemas import Health, LatestChecks, Problem
+from abbe.service.web.strip import strip_of
 
 
 def add_api(app: FastAPI, sources: Sources) -> None:
@@ -168,6 +169,11 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
     @needs(Permission.READ)
     async def page() -> HTMLResponse:
         return HTMLResponse(render(env, await source.status(), await source.verifications(PAGE_ROWS)))
+
+    @app.get("/strip", response_class=HTMLResponse, include_in_schema=False)
+    @needs(Permission.READ)
+    async def strip() -> HTMLResponse:
+        return HTMLResponse(env.get_template("strip.html").render(bar=strip_of(await source.status())))
 
     @app.get("/api/v1/openapi.json", include_in_schema=False)
     @needs(Permission.READ)

@@ -81,6 +81,23 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         visit.target = f"job {job}, prompt {prompt}"
         return answered(core, await core.confirm_prompt(job, prompt, visit.principal.name))
 
+    _add_stopping(app, core)
+
+
+def _add_stopping(app: FastAPI, core: CoreLine) -> None:
+    """Add the routes that stop, abort, pause and resume."""
+
+    @app.post("/api/v1/stop", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
+    @needs(Permission.STOP)
+    async def stop(request: Request) -> Response:
+        """Stop whatever runs, as ``/api/v1/jobs/{job}/stop`` does. A session that has run out is enough; 409: nothing runs."""
+        visit: Visit = request.state.visit
+        running = next((job for job in core.jobs() if job.ended_utc is None), None)
+        if running is None:
+            return problem(409, "nothing that this service can stop is running")
+        visit.target = f"job {running.id}"
+        return answered(core, await core.steer(running.id, "stop", visit.principal.name))
+
     def add_steering(how: Steering, summary: str) -> None:
         @app.post(
             f"/api/v1/jobs/{{job}}/{how}",
@@ -90,7 +107,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
             summary=summary,
             operation_id=f"{how}_job",
         )
-        @needs(Permission.MEASURE)
+        @needs(Permission.STOP if how in {"stop", "abort"} else Permission.MEASURE)
         async def steer(request: Request, job: Annotated[str, NUMBER]) -> Response:
             visit: Visit = request.state.visit
             return answered(core, await core.steer(job, how, visit.principal.name))

@@ -16,8 +16,11 @@ from abbe.service.web.formatting import figure_name
 NAMES: Mapping[str, str] = {"en": "English", "de": "Deutsch", "ja": "日本語", "ko": "한국어"}
 DEFAULT = "en"
 FOLDER = Path(__file__).parent / "catalogues"
-SPAN_KEYS = ("span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core")
-"""Texts that the script of the home page fills with numbers."""
+SPAN_KEYS = (
+    "span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core", "login",
+    "strip.stopped", "strip.nothing", "strip.failed", "strip.out",
+)  # fmt: skip
+"""Texts of the script that every screen has."""
 
 
 @cache

@@ -15,6 +15,7 @@ from abbe.service.domain.verification import Verification
 from abbe.service.queries.status import Status
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
+from abbe.service.web.strip import strip_of
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
 
@@ -55,6 +56,7 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
     latest = next((check for check in past if not check.push or check.verdict == "pass"), None)
     return env.get_template("page.html").render(
         status=status,
+        bar=strip_of(status),
         past=past,
         latest=latest,
         figures=figures(past),

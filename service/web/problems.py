@@ -1,7 +1,4 @@
-"""The only mapping from errors to application/problem+json; codes and statuses come from the catalogue.
-
-While the core is silent, people get a screen and programs a problem document: old values are never shown as current.
-"""
+"""The only mapping from errors to application/problem+json; codes and statuses come from the catalogue."""
 
 from __future__ import annotations
 
@@ -9,12 +6,11 @@ from http import HTTPStatus
 
 from fastapi import FastAPI, Request
 from fastapi.exceptions import RequestValidationError
-from fastapi.responses import HTMLResponse, JSONResponse, Response
-from jinja2 import Environment
+from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from abbe.service.errors import AbbeError, CoreSilent
+from abbe.service.errors import AbbeError
 from abbe.service.web.catalogue import DEFECT, HTTP, status_of
 from abbe.service.web.schemas import Problem
 
@@ -77,24 +73,3 @@ def install(app: FastAPI) -> None:
     app.add_exception_handler(ClientDisconnect, _disconnected)
     app.add_exception_handler(AbbeError, _abbe)
     app.add_exception_handler(Exception, _defect)
-
-
-RETRY_S = "5"
-
-
-def add_core_unavailable(app: FastAPI, env: Environment) -> None:
-    """Install the handler of `CoreSilent` for every address."""
-
-    async def silent(request: Request, error: Exception) -> Response:
-        assert isinstance(error, CoreSilent)
-        if not for_people(request):
-            return problem_of(error)
-        return HTMLResponse(env.get_template("core_unavailable.html").render(text=str(error)), 503, {"Retry-After": RETRY_S})
-
-    app.add_exception_handler(CoreSilent, silent)
-
-
-def for_people(request: Request) -> bool:
-    """Whether the request is for a screen. The home page always is: its script fetches it without an Accept header."""
-    path = request.url.path
-    return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))

@@ -24,7 +24,7 @@ class Open(Enum):
 Need = Permission | Open
 PUBLIC = Open.PUBLIC
 ACTIVE_HEADER = "X-Abbe-Active"
-REFRESHED = frozenset({"/api/v1/status", "/api/v1/live", "/api/v1/live/samples"})
+REFRESHED = frozenset({"/strip", "/api/v1/status", "/api/v1/live", "/api/v1/live/samples"})
 """Paths that pages refresh by themselves."""
 MOUNTS: dict[str, Need] = {"/static": PUBLIC}
 

@@ -1,6 +1,7 @@
 """Middleware that checks rate, identity, body length, permission and origin before every route, and records changing requests.
 
-Pure ASGI. It reads no body of an unknown visitor.
+Pure ASGI. It reads no body of an unknown visitor. A request that stops the machine passes with a session that is idle or too old, and does
+not wait for the audit.
 """
 
 from __future__ import annotations
@@ -9,6 +10,7 @@ import hmac
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+import structlog
 from starlette.requests import HTTPConnection
 from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute
@@ -17,6 +19,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AbbeError
 from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, Principal
+from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import Body
 from abbe.service.web.login.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
 from abbe.service.web.login.authentication import Authenticator, csrf_token
@@ -24,6 +27,7 @@ from abbe.service.web.login.origin import address_of, is_ours, is_tls
 from abbe.service.web.problems import problem
 
 CSRF_HEADER = "X-CSRF-Token"
+stop_log = structlog.get_logger("abbe.audit")
 
 
 @dataclass
@@ -91,7 +95,9 @@ class AuthMiddleware:
         secret = None if self._auth is None else request.cookies.get(self._auth.cookie(tls=tls))
         if need is not PUBLIC or (changes and secret):
             used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
-            visit.principal = LOCAL_VIEWER if self._auth is None else await self._auth.who(bearer, secret, in_use=used)
+            visit.principal = LOCAL_VIEWER
+            if self._auth is not None:
+                visit.principal = await self._auth.who(bearer, secret, in_use=used, to_stop=need is Permission.STOP)
         visit.secret = (secret or "") if visit.principal.by == "session" else ""
         if need is not PUBLIC and (unknown := _unknown(request, visit.principal, changes=changes)) is not None:
             return unknown
@@ -118,10 +124,11 @@ class AuthMiddleware:
     async def _recorded(
         self, auth: Authenticator, route: BaseRoute, visit: Visit, refused: Response | None, call: tuple[Scope, Receive, Send]
     ) -> None:
-        """Answer once the record is on disk. Work that cannot be recorded does not begin."""
+        """Answer once the record is on disk. Work that cannot be recorded does not begin; a stop does."""
         scope, receive, send = call
         log = _Log(auth, visit, f"{scope['method']} {getattr(route, 'path', '')}", scope["path"], refused=refused is not None)
-        if refused is None:
+        stops = need_of(route) is Permission.STOP
+        if refused is None and not stops:
             try:
                 await auth.ready()
             except AbbeError as error:
@@ -133,6 +140,10 @@ class AuthMiddleware:
                 try:
                     await log.answered(int(message["status"]))
                 except AbbeError as error:
+                    if stops and refused is None:
+                        stop_log.error("a stop was not recorded", cause=error.detail, who=visit.principal.name)
+                        await send(message)
+                        return
                     log.unrecorded = True
                     await problem(503, error.detail, error.code, {"Retry-After": "5"})(*call)
             if not log.unrecorded:

@@ -70,18 +70,18 @@ class Authenticator:
         """Name of the cookie that marks a browser with an earlier login."""
         return f"{self._cookie}-device"
 
-    async def who(self, bearer: str | None, secret: str | None, *, in_use: bool = True) -> Principal:
+    async def who(self, bearer: str | None, secret: str | None, *, in_use: bool = True, to_stop: bool = False) -> Principal:
         """Identify the visitor by token, else by cookie; an onlooker while there are no users.
 
-        ``in_use`` False: an automatic refresh, which does not extend the session.
+        ``in_use`` False: an automatic refresh, which does not extend the session; ``to_stop``: see `People.by_session`.
         """
-        return await asyncio.to_thread(self._who, bearer, secret, in_use)
+        return await asyncio.to_thread(self._who, bearer, secret, in_use, to_stop)
 
-    def _who(self, bearer: str | None, secret: str | None, in_use: bool) -> Principal:
+    def _who(self, bearer: str | None, secret: str | None, in_use: bool, to_stop: bool) -> Principal:
         if bearer is not None:
             return self.people.by_token(bearer)
         if secret:
-            found = self.people.by_session(secret, in_use=in_use)
+            found = self.people.by_session(secret, in_use=in_use, to_stop=to_stop)
             if found is not ANONYMOUS:
                 return found
         return ANONYMOUS if self.people.has_users() else LOCAL_VIEWER

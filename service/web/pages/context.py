@@ -19,6 +19,7 @@ from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.web import formatting
 from abbe.service.web.login.authentication import Authenticator
+from abbe.service.web.strip import strip_of
 
 T = TypeVar("T")
 
@@ -42,7 +43,7 @@ class PageContext:
         """Respond with a screen; its times are in the zone of the timetable."""
         now = await self.source.status()
         zone = zone_of(now)
-        values |= {"machine": now.machine, "zone": zone, "stamp": lambda text: stamp(text, zone)}
+        values |= {"bar": strip_of(now), "machine": now.machine, "zone": zone, "stamp": lambda text: stamp(text, zone)}
         return HTMLResponse(self.env.get_template(template).render(**values), status)
 
     async def missing(self, what: str, number: int) -> HTMLResponse:

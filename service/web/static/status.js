@@ -1,5 +1,6 @@
-// Shows on every screen whether the service answers. Refreshes the home page: progress every 2 s from the JSON, everything else from the
-// server when the revision changes. Other screens are not replaced, since a person may be reading or filling in a form.
+// Shows on every screen whether the service answers, and the status bar with Stop. Refreshes the home page: progress every 2 s from the JSON,
+// everything else from the server when the revision changes. Other screens are not replaced, since a person may be reading or filling in a
+// form.
 
 const PERIOD_MS = 2000;
 const PATIENCE_MS = 5000;
@@ -57,6 +58,35 @@ function showStatus(status) {
   setText("job-left", left(status.job.eta_s));
 }
 
+// The bar comes from the server again when anything in it but the time left has changed.
+let shownBar = "";
+
+async function showBar(status) {
+  setText("strip-left", status.job ? left(status.job.eta_s) : "");
+  const next = JSON.stringify([status.revision, status.job?.state, status.job?.stage, status.job?.step, status.devices.map((one) => one.state)]);
+  if (next === shownBar) return;
+  const answer = await ask("/strip", false);
+  if (!answer.ok) return;
+  const page = new DOMParser().parseFromString(await answer.text(), "text/html");
+  const told = document.getElementById("stop-told");
+  document.getElementById("machine-bar").replaceWith(page.getElementById("machine-bar"));
+  if (told) document.getElementById("stop-told")?.replaceWith(told);
+  shownBar = next;
+}
+
+// Stop stays in its place and works with a session that has run out; the answer stands beside it.
+async function stop(button) {
+  const told = (text) => setText("stop-told", text);
+  const answer = await fetch("/api/v1/stop", { method: "POST", headers: { "X-CSRF-Token": button.dataset.csrf } }).catch(() => null);
+  if (answer?.ok) told(words["strip.stopped"]);
+  else told(answer?.status === 409 ? words["strip.nothing"] : words["strip.failed"]);
+}
+
+document.addEventListener("click", (event) => {
+  const button = event.target.closest("#stop");
+  if (button) stop(button);
+});
+
 function ask(path, active) {
   return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: AbortSignal.timeout(PATIENCE_MS) });
 }
@@ -77,13 +107,26 @@ function connected(yes, silent = false) {
   document.body.classList.toggle("stale", !yes);
 }
 
+function loggedOut() {
+  connected(false);
+  const link = document.createElement("a");
+  link.href = "/login";
+  link.textContent = words.login;
+  banner.replaceChildren(`${words["strip.out"]} `, link);
+}
+
 async function refresh() {
   let silent = false;
   try {
     const active = touched;
     touched = false;
     const answer = await ask("/api/v1/status", active);
-    if (answer.status === 401) location.assign("/login");
+    if (answer.status === 401) {
+      // While the machine is being measured the screen stays, since its Stop still works.
+      if (!document.querySelector("#machine-bar .busy")) location.assign("/login");
+      loggedOut();
+      return;
+    }
     if (!answer.ok) {
       silent = answer.status === 503 && (await answer.json()).code === "SRV-002";
       throw new Error(`status ${answer.status}`);
@@ -93,6 +136,7 @@ async function refresh() {
     if (revision === "") { location.reload(); return; }
     if (revision !== undefined && status.revision !== revision) await replaceContent(status.revision);
     showStatus(status);
+    await showBar(status);
     connected(true);
   } catch {
     // Whatever the reason, the page is stale from now on.

@@ -39,6 +39,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView, reconciled
+from abbe.service.users.roles import Permission
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
@@ -84,7 +85,7 @@ class Bench:
         terms = LoopTerms(follow_ups=self.desk, run_job=self.book.run)
         self.scheduler = Scheduler([YEARLY], FakeLedger(), self.book, FakeShelf(), self.clock, terms)
 
-    async def _may(self, who: str) -> bool:
+    async def _may(self, who: str, *_need: Permission) -> bool:
         return who == "user:bob"
 
     async def _check(self, schedule: Schedule, slot: datetime, control: Control) -> SlotState:
@@ -190,7 +191,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
     await running.until(lambda: running.jobs("running"))
     (job,) = running.jobs()
     assert (job.kind, job.recipe, job.schedule, job.who) == ("investigation", "identification", "investigation of alarm 1", "")
-    assert await running.steer("stop", "user:eve") == ("forbidden", "user:eve may not measure here")
+    assert await running.steer("stop", "user:eve") == ("forbidden", "user:eve may not stop here")
     assert (await running.steer("pause"))[0] == "done"
     assert running.jobs()[0].state == "pausing"
     assert (await running.steer("resume"))[0] == "done"

@@ -27,6 +27,7 @@ from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, Prompts
 from abbe.service.storage.store import Store
+from abbe.service.users.roles import Permission
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
@@ -50,7 +51,7 @@ class Bench:
     news: asyncio.Event = field(default_factory=asyncio.Event)
 
     def __post_init__(self) -> None:
-        async def may(who: str) -> bool:
+        async def may(who: str, *_need: Permission) -> bool:
             return who in self.allowed
 
         async def may_propose(who: str) -> bool:

@@ -56,7 +56,7 @@ class Bench:
         async def allowed(who: str) -> bool:
             return who == "user:ann"
 
-        async def anybody(_: str) -> bool:
+        async def anybody(_: str, *_need: Permission) -> bool:
             return True
 
         self.book = JobRegistry(fake_checks(self.check), ("quick-check",), anybody, self.clock, self.news.set)

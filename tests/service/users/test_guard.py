@@ -165,7 +165,7 @@ async def test_a_page_that_refreshes_itself_does_not_keep_its_session_alive(gate
 async def test_the_page_has_a_way_out_for_who_is_logged_in(gate: Gate) -> None:
     page = (await gate.ask("GET", "/", headers=gate.session("a-viewer"))).text
     assert '<button id="logout" type="submit"' in page
-    assert '<span class="quiet">a-viewer</span>' in page
+    assert 'href="/settings">a-viewer</a>' in page
     assert "/static/send.js" in page
     assert 'id="logout"' not in (await gate.ask("GET", "/", headers=gate.token("a-viewer", "t", ["read"]))).text
     async with client_of(app_of(gate.world, None)) as client:

@@ -84,6 +84,7 @@ def test_a_session_ends_by_idleness_age_password_role_and_disabling(world: World
     idle = begin()
     clock.later(minutes=15, seconds=1)
     assert people.by_session(idle) is ANONYMOUS
+    assert people.by_session(idle, to_stop=True).name == "user:ana"
     for change in (
         lambda: people.set_role("ana", "viewer"),
         lambda: people.set_password("ana", PHRASE + "!"),
@@ -92,7 +93,7 @@ def test_a_session_ends_by_idleness_age_password_role_and_disabling(world: World
         secret = begin()
         assert people.by_session(secret) is not ANONYMOUS
         change()
-        assert people.by_session(secret) is ANONYMOUS
+        assert people.by_session(secret, to_stop=True) is ANONYMOUS
     people.disable("ana", enable=True)
     assert people.by_session(secret) is ANONYMOUS
     assert people.by_session("x" * 43) is ANONYMOUS
@@ -123,7 +124,7 @@ def test_a_token_has_at_most_its_scopes_and_ends(world: World) -> None:
     people.add("root", "admin", PHRASE)
     people.add("met", "metrologist", PHRASE)
     text = people.add_token("met", "ci", ["read", "measure"], 2)
-    assert people.by_token(text).permissions == {Permission.READ, Permission.MEASURE}
+    assert people.by_token(text).permissions == {Permission.READ, Permission.MEASURE, Permission.STOP}  # whoever starts may stop
     people.set_role("met", "viewer")  # the rights of today, not those of the day it was made
     assert people.by_token(text).permissions == {Permission.READ}
     people.disable("met")

@@ -29,6 +29,7 @@ from abbe.service.web.pages.new import script_texts
 from abbe.service.web.pages.rehearsal import CAMPAIGN
 from abbe.service.web.pages.runs import pictures, run_document
 from abbe.service.web.pages.whatif import forecast
+from abbe.service.web.strip import strip_of
 from abbe.service.web.units import INCH, METRIC
 from tests.pages_world import Served, as_user
 from tests.service.web.pages.test_rehearsal import PLANS, TOLD
@@ -194,7 +195,7 @@ def test_a_dry_run() -> None:
     dry = PLANS.run("quick-check", 100, Unit("in", IN))
     assert dry is not None
     told = SimpleNamespace(job=None, next_due=[])
-    known = {"choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
+    known = {"bar": strip_of(None), "choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
     known |= {"max_feed": TOLD.max_feed_mm_min, "may_measure": True, "guided": False, "key": "k", "expired": [], "temperature_c": None}
     page = html.unescape(environment().get_template("new.html").render(machine="m", zone="UTC", status=told, dry=dry, **known))
     assert f"{dry.fastest_mm_min / IN:.2f} in/min (Limit {6000 / IN:.2f})" in page
@@ -233,7 +234,7 @@ def test_a_live_run_gives_its_script_the_unit() -> None:
     moment = SimpleNamespace(job=job, next_due=[], now_utc=now)
     words = script_texts("en")
     screen = environment().get_template("live.html")
-    page = html.unescape(screen.render(machine="m", zone="UTC", status=moment, may_measure=True, texts=words))
+    page = html.unescape(screen.render(bar=strip_of(None), machine="m", zone="UTC", status=moment, may_measure=True, texts=words))
     assert f'data-unit="µin" data-size="{UIN}"' in page
     assert re.findall(r"</span> (µ\w+)", page) == ["µin", "µin"]
     assert "µm" not in page

@@ -22,6 +22,7 @@ from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.storage.store import Store
+from abbe.service.users.roles import Permission
 from tests.pages_world import Filled, Served
 from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed
@@ -50,7 +51,7 @@ class Bench:
     async def never(self, *_: object) -> SlotState:
         raise AssertionError
 
-    async def anybody(self, _: str) -> bool:
+    async def anybody(self, _: str, *_need: Permission) -> bool:
         return True
 
     async def anna(self, who: str) -> bool:

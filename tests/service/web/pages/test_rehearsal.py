@@ -20,6 +20,7 @@ from abbe.service.web.page import HERE, environment
 from abbe.service.web.pages.new import expired_certificates
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 from abbe.service.web.schemas import LONGEST_RECIPE
+from abbe.service.web.strip import strip_of
 from tests.service.core.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}
@@ -79,7 +80,7 @@ def test_a_rate_is_part_of_the_name() -> None:
 
 def test_the_screen_counts_the_set_ups() -> None:
     told = SimpleNamespace(job=None, next_due=[])
-    known = {"choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
+    known = {"bar": strip_of(None), "choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
     known |= {"max_feed": 6000.0, "may_measure": True, "guided": False, "key": "k", "expired": [], "temperature_c": None}
     screen = environment().get_template("new.html")
     assert "<dd>5</dd>" in screen.render(machine="m", zone="UTC", status=told, dry=PLANS.run("quick-check", 100), **known)
