@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
     from abbe.service.instrument_files.answers import Answers, Question
     from abbe.service.instrument_files.campaign import Made
+    from abbe.service.instrument_files.columns import ColumnFile
     from abbe.service.instrument_files.content import Content
 
 NOT_STORED = 1
@@ -27,6 +28,9 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     yes: Annotated[bool, typer.Option("--yes", help="Store the files without asking.")] = False,
     name: Annotated[
         str | None, typer.Option("--name", help="Name of the campaign. Default: that of the first file.", show_default=False)
+    ] = None,
+    columns: Annotated[
+        Path | None, typer.Option("--columns", metavar="FILE", help="What the columns of a table are (TOML).", show_default=False)
     ] = None,
     axis: Annotated[str | None, typer.Option("--axis", help="X, Y or Z, for a file that does not say it.", show_default=False)] = None,
     unit: Annotated[str | None, typer.Option("--unit", help="Of the readings, for such a file: mm, um ...", show_default=False)] = None,
@@ -45,9 +49,10 @@ def import_files(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Import a campaign folder, or files of instruments as one campaign after a preview: all of it or, after any mistake, nothing.
 
-    Files: .rtl, .rta. What they do not say is asked, or stays unknown and widens U. Temperatures of the options count for files that
-    state none. --machine FILE: the machine with its chain and strokes, and its database. Without a terminal and without --yes the preview
-    is printed, nothing is stored, and the exit code is 1.
+    Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
+    about their columns; the answers are kept as FILE.columns.toml. What files do not say is asked, or stays unknown and widens U.
+    Temperatures of the options count for files that state none. --machine FILE: the machine with its chain and strokes, and its
+    database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
     from abbe.service.instrument_files.answers import Answers
 
@@ -57,7 +62,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     answers = Answers(
         axis=axis, unit=unit, sign=sign, at_mm=at_mm, scale_c=scale_c, air_c=air_c, pressure_hpa=pressure_hpa, feed_mm_min=feed_mm_min
     )
-    _import_files(files, answers, name or files[0].stem, (db, machine), yes=yes)
+    _import_files(files, columns, answers, name or files[0].stem, (db, machine), yes=yes)
 
 
 def _import_folder(folder: Path, db: str | None, machine: Path | None) -> None:
@@ -69,7 +74,9 @@ def _import_folder(folder: Path, db: str | None, machine: Path | None) -> None:
         typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")
 
 
-def _import_files(files: list[Path], answers: Answers, name: str, where: tuple[str | None, Path | None], *, yes: bool) -> None:
+def _import_files(
+    files: list[Path], columns: Path | None, answers: Answers, name: str, where: tuple[str | None, Path | None], *, yes: bool
+) -> None:
     from abbe.service.config import load_machine
     from abbe.service.instrument_files.answers import checked
     from abbe.service.instrument_files.campaign import campaign_of
@@ -79,7 +86,7 @@ def _import_files(files: list[Path], answers: Answers, name: str, where: tuple[s
 
     db, machine = where
     site = None if machine is None else site_of(load_machine(machine).machine)
-    contents = [read_file(path) for path in files]
+    contents = [read_file(path, _columns(path, columns)) for path in files]
     answers = _asked(contents, checked(answers))
     made = campaign_of(contents, answers, name, None if site is None else site.doc)
     _preview(contents, answers, made)
@@ -90,6 +97,53 @@ def _import_files(files: list[Path], answers: Answers, name: str, where: tuple[s
         record = store.campaigns.find(store_folder(store, made.folder))
         typer.echo(f"imported campaign {record.name!r} with {len(made.folder.runs)} runs into {store.url}")
         typer.echo(f"`abbe report {record.name}` evaluates it")
+
+
+def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
+    """The column file of a table: as given, as kept beside it, or by questions at the terminal; None if there is none."""
+    from abbe.service.instrument_files.columns import column_file, toml_of
+    from abbe.service.instrument_files.registry import is_table
+
+    if not is_table(path):
+        return None
+    kept = path.with_name(path.name + ".columns.toml")
+    if columns is not None or kept.exists():
+        return column_file(columns or kept)
+    if not sys.stdin.isatty():
+        return None
+    found = _columns_asked(path)
+    kept.write_text(toml_of(found), encoding="utf-8")
+    typer.echo(f"your answers are in {kept}")
+    return found
+
+
+def _columns_asked(path: Path) -> ColumnFile:
+    """Ask for heading, axis, columns and units of a table."""
+    from abbe.service.instrument_files.answers import ANGLES, LENGTHS
+    from abbe.service.instrument_files.columns import ColumnFile, guesses
+    from abbe.service.instrument_files.registry import headings_of
+
+    heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=1)
+    names = headings_of(path, heading)
+    guess = dict(guesses(names))
+
+    def column(what: str, key: str) -> str | int:
+        found = _choice(f"column of {what}", names, guess.get(key))
+        return found if heading else int(found)
+
+    axis = _choice("which axis was measured", ("X", "Y", "Z"))
+    target = {"column": column("the targets", "target"), "unit": _choice("its unit", list(LENGTHS), "mm")}
+    kind = _choice("readings are", ("deviation", "measured"), "measured" if "measured" in guess else "deviation")
+    value = {
+        "column": column(f"the {kind} values", kind),
+        "unit": _choice("its unit", list(LENGTHS | ANGLES if kind == "deviation" else LENGTHS)),
+    }
+    doc = {"axis": axis, "target": target, kind: value, "heading": heading}
+    if typer.confirm("is there a column of the direction?", default="direction" in guess):
+        way = {"column": column("the direction", "direction")}
+        words = {sign: typer.prompt(f"its word for {sign} of the axis", default=usual) for sign, usual in (("plus", "+"), ("minus", "-"))}
+        doc["direction"] = way | words
+    return ColumnFile.model_validate(doc)
 
 
 def _asked(contents: Sequence[Content], answers: Answers) -> Answers:
@@ -107,10 +161,15 @@ def _asked(contents: Sequence[Content], answers: Answers) -> Answers:
 
 
 def _answer(name: str, question: Question) -> Any:
-    from click import Choice
-
     text = f"{name} does not say {question.text}"
-    return typer.prompt(text, type=Choice(question.choices) if question.choices else float)
+    return _choice(text, question.choices) if question.choices else typer.prompt(text, type=float)
+
+
+def _choice(text: str, choices: Sequence[str], usual: str | None = None) -> str:
+    """Ask until one of the choices is given."""
+    while (found := str(typer.prompt(f"{text} ({', '.join(choices)})", default=usual))) not in choices:
+        typer.echo(f"{found!r} is none of them")
+    return found
 
 
 def _preview(contents: Sequence[Content], answers: Answers, made: Made) -> None:

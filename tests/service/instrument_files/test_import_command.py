@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import os
+import pty
+import subprocess
+import sys
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from tests.service.cli.test_cli import MACHINE_FILE, Abbe, abbe
-from tests.service.instrument_files.examples import ENVIRONMENT, renishaw
+from tests.service.instrument_files.examples import B5R, COLUMNS, ENVIRONMENT, POS, TABLE, renishaw, rtx
 
 __all__ = ["abbe"]  # the fixture
 pytestmark = pytest.mark.usefixtures("clean_environment")
@@ -123,3 +127,59 @@ def test_a_campaign_of_files_survives_export_and_import(abbe: Abbe) -> None:
     first, second = report(abbe, "c"), report(abbe, "c", "--db", "sqlite:///other.sqlite3")
     assert first["figures"] == second["figures"]
     assert [line for line in first["remarks"] if "does not say" in line] == [line for line in second["remarks"] if "does not say" in line]
+
+
+def test_results_of_a_ball_bar_are_reported_without_an_uncertainty(abbe: Abbe) -> None:
+    Path("xy.b5r").write_text(B5R.format(encoding="utf-8", machine="VMC-1"))
+    assert abbe("import", "xy.b5r", "x.rtl", "--yes", "--name", "both").code == 0
+    found = report(abbe, "both")
+    (circularity,) = [one for one in found["figures"] if one["symbol"] == "AF_CIRCULARITY"]
+    assert (circularity["value"], circularity["expanded"], circularity["unit"]) == (11.4, None, "µm")
+    assert any("the file holds no uncertainty" in line for line in found["not_observable"])
+
+
+def test_a_sign_that_a_file_does_not_say_is_asked(abbe: Abbe) -> None:
+    Path("y.pos").write_text(POS)
+    assert "y.pos: the file does not say what the values are" in abbe.fails("import", "y.pos", "--yes")
+    assert abbe("import", "y.pos", "--yes", "--sign", "nominal-measured").code == 0
+    found = figures(report(abbe, "y"))
+    assert found["E"][0] == pytest.approx(14.0)
+    assert found["R"] == (None, None)
+    only = POS[: POS.index("Position   \tForward")]
+    Path("both.pos").write_text(only)
+    abbe("import", "both.pos", "--yes", "--sign", "measured-nominal")
+    assert figures(report(abbe, "both"))["M"] == (pytest.approx(11.0), None)
+
+
+def test_a_trace_asks_for_its_unit_and_place(abbe: Abbe) -> None:
+    Path("d.rtx").write_bytes(rtx())
+    assert "the file does not say the unit of the readings - give --unit VALUE" in abbe.fails("import", "d.rtx", "--yes", "--axis", "X")
+    assert abbe("import", "d.rtx", "--yes", "--axis", "X", "--unit", "um", "--at", "100").code == 0
+    assert abbe("report", "d", "--out", "d.json").code == 0
+
+
+def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:
+    Path("t.csv").write_text(TABLE)
+    Path("c.toml").write_text(COLUMNS)
+    assert "t.csv: what are the columns? - give --columns FILE" in abbe.fails("import", "t.csv", "--yes")
+    assert abbe("import", "t.csv", "--yes", "--columns", "c.toml").code == 0
+    assert figures(report(abbe, "t"))["E"][0] == pytest.approx(14.0)
+
+
+def test_a_person_is_asked_at_the_terminal(tmp_path: Path) -> None:
+    """Columns, units, axis and whether to store; the answers are kept beside the table, so that the next one needs none."""
+    Path("t.csv").write_text(TABLE.replace(",", "."))
+    answers = ["2", "X", "Target", "mm", "measured", "Reading", "mm", "y", "Dir", "+", "-", "y"]
+    master, slave = pty.openpty()
+    os.write(master, "".join(f"{one}\n" for one in answers).encode())
+    command = [str(Path(sys.executable).with_name("abbe")), "import", "t.csv"]
+    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, timeout=60, check=False)
+    os.close(master)
+    os.close(slave)
+    assert done.returncode == 0, done.stderr
+    assert "your answers are in t.csv.columns.toml" in done.stdout
+    assert "imported campaign 't' with 1 runs" in done.stdout
+    again = subprocess.run(
+        [*command, "--yes", "--name", "u"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False
+    )
+    assert "imported campaign 'u' with 1 runs" in again.stdout, again.stderr

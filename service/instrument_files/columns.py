@@ -1,0 +1,352 @@
+"""Any table of readings (CSV, TSV, XLSX) with a file that says what its columns are, or with questions about them."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+import tomllib
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_validator
+
+from abbe.models.arrays import F1
+from abbe.service.config_schema import COLDEST_C, WARMEST_C
+from abbe.service.errors import FileFormatError, expected, location_text
+from abbe.service.formats.files import TextFile
+from abbe.service.instrument_files.answers import ANGLES, LENGTHS
+from abbe.service.instrument_files.content import AxisReadings, Content, axis_of, digest, read_bytes, step_of, text_file
+
+TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
+TEMPERATURES = {"C": 0.0, "K": -273.15}
+"""Units of temperature: what is added to reach °C."""
+PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1000.0}
+POSSIBLE_PA = (60_000.0, 110_000.0)
+MOST_ROWS = 200_000
+Column = Annotated[str | int, Field(description="heading of the column, or its number from 1")]
+
+
+class Part(BaseModel):
+    """Base of the objects of a column file: unknown keys are mistakes."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class Measured(Part):
+    """One column with a unit."""
+
+    column: Column
+    unit: str
+
+
+class Direction(Part):
+    """The column that says from where a target was approached, and its words for + and - of the axis."""
+
+    column: Column
+    plus: str = "+"
+    minus: str = "-"
+
+
+def toml_of(columns: ColumnFile) -> str:
+    """The column file as TOML, without what is default."""
+    doc = columns.model_dump(exclude_none=True, exclude_defaults=True)
+    plain = {key: value for key, value in doc.items() if not isinstance(value, dict)}
+    lines = ['format = "abbe-columns/1"', *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
+    for key, part in doc.items():
+        if isinstance(part, dict):
+            lines += [f"\n[{key}]", *(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in part.items())]
+    return "\n".join(lines) + "\n"
+
+
+class ColumnFile(Part):
+    """What the columns of a table are (``abbe-columns/1``, TOML).
+
+    ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. ``heading``: row of the headings, 0
+    for none; rows above it are not read. ``decimal``: the decimal sign of a text file.
+    """
+
+    format: Literal["abbe-columns/1"] = "abbe-columns/1"
+    axis: Literal["X", "Y", "Z"]
+    target: Measured
+    measured: Measured | None = None
+    deviation: Measured | None = None
+    direction: Direction | None = None
+    time: Measured | None = None
+    scale_temperature: Measured | None = None
+    air_temperature: Measured | None = None
+    air_pressure: Measured | None = None
+    heading: int = Field(default=1, ge=0, le=1000)
+    delimiter: Literal[",", ";", "tab", "blank"] | None = None
+    decimal: Literal[".", ","] = "."
+    sheet: str | None = None
+
+    @model_validator(mode="after")
+    def _possible(self) -> Self:
+        if (self.measured is None) == (self.deviation is None):
+            raise ValueError("expected either measured (positions) or deviation, got " + ("none" if self.measured is None else "both"))
+        for name, units in _UNITS.items():
+            one = getattr(self, name)
+            if one is not None and one.unit not in units:
+                raise ValueError(f"{name}.unit is {one.unit!r}, expected one of {', '.join(units)}")
+        return self
+
+
+_UNITS: dict[str, Any] = {
+    "target": LENGTHS,
+    "measured": LENGTHS,
+    "deviation": LENGTHS | ANGLES,
+    "time": TIMES,
+    "scale_temperature": TEMPERATURES,
+    "air_temperature": TEMPERATURES,
+    "air_pressure": PRESSURES,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Rows:
+    """A table: each row with its number in the file, and its cells as text."""
+
+    file: TextFile
+    rows: list[tuple[int, list[str]]]
+
+    def headings(self, heading: int) -> list[str]:
+        """Cells of the row of headings; numbers from 1 without one."""
+        if heading:
+            found = next((cells for line, cells in self.rows if line == heading), None)
+            if found is None:
+                raise self.file.wrong(heading, "the row of headings is empty, or the file is shorter")
+            return [cell.strip() for cell in found]
+        return [str(k + 1) for k in range(max((len(cells) for _, cells in self.rows), default=0))]
+
+
+def column_file(path: Path) -> ColumnFile:
+    """Read a column file.
+
+    Raises
+    ------
+    FileFormatError
+        It has a mistake; the message names the key.
+    """
+    try:
+        return ColumnFile.model_validate(tomllib.loads(read_bytes(path).decode("utf-8")))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+        raise FileFormatError(f"{path}: no TOML: {err}", "see docs/how-to/import.md") from None
+    except ValidationError as err:
+        first = err.errors()[0]
+        place = location_text(first["loc"])
+        raise FileFormatError(f"{path}: {f'{place}: ' if place else ''}{expected(first)}", "see docs/how-to/import.md") from None
+
+
+def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> Rows:
+    """Cells of a CSV, TSV or XLSX. The row ``heading`` shows how a text file is divided, if ``delimiter`` does not say it.
+
+    Raises
+    ------
+    FileFormatError
+        It is none, or has no rows.
+    """
+    if name.lower().endswith((".xlsx", ".xlsm")):
+        return _excel(name, data, sheet)
+    file = text_file(name, data)
+    sign = _delimiter(file, heading, delimiter)
+    rows = []
+    for line, text in file.lines():
+        if text.strip():
+            try:
+                rows.append((line, text.split() if sign == " " else next(csv.reader([text], delimiter=sign, strict=True))))
+            except csv.Error as err:
+                raise file.wrong(line, f"no row of a table: {err}") from None
+        if len(rows) > MOST_ROWS:
+            raise file.wrong(line, f"more than {MOST_ROWS} rows")
+    if not rows:
+        raise file.wrong(1, "the table is empty")
+    return Rows(file, rows)
+
+
+def _delimiter(file: TextFile, heading: int, delimiter: str | None) -> str:
+    if delimiter is not None:
+        return {"tab": "\t", "blank": " "}.get(delimiter, delimiter)
+    first = next((text for line, text in file.lines() if line >= heading and text.strip()), "")
+    return next((sign for sign in ("\t", ";", ",") if sign in first), " ")
+
+
+def _excel(name: str, data: bytes, sheet: str | None) -> Rows:
+    try:
+        from python_calamine import CalamineError, CalamineWorkbook
+    except ModuleNotFoundError:
+        raise FileFormatError(
+            f"{name}: reading Excel files needs a library", "pip install 'abbe[excel]', or save the table as CSV"
+        ) from None
+    file = TextFile(name, "", FileFormatError)
+    try:
+        book = CalamineWorkbook.from_filelike(io.BytesIO(data))
+        names = book.sheet_names
+        if sheet is not None and sheet not in names:
+            raise file.wrong(1, f"there is no sheet {sheet!r}; there are {', '.join(names)}")
+        cells = book.get_sheet_by_name(sheet or names[0]).to_python(skip_empty_area=False)
+    except (CalamineError, IndexError) as err:
+        raise file.wrong(1, f"no Excel workbook: {' '.join(str(err).split())}", "save it again") from None
+    rows = [(k, [_text(cell) for cell in row]) for k, row in enumerate(cells, start=1)]
+    rows = [(line, row) for line, row in rows if any(row)]
+    if not rows or len(rows) > MOST_ROWS:
+        raise file.wrong(1, f"the sheet has {len(rows)} rows, expected 1 to {MOST_ROWS}")
+    return Rows(file, rows)
+
+
+def _text(cell: Any) -> str:
+    return repr(cell) if isinstance(cell, float) else str(cell).strip()
+
+
+def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
+    """Read a table by its column file.
+
+    Raises
+    ------
+    FileFormatError
+        A column is missing, or a cell is wrong; the message has the row.
+    """
+    table = table_of(name, data, columns.heading, columns.delimiter, columns.sheet)
+    headings = table.headings(columns.heading)
+    body = [(line, cells) for line, cells in table.rows if line > columns.heading]
+    if len(body) < 2:
+        raise table.file.wrong(table.rows[-1][0], f"{len(body)} rows of readings, expected two or more")
+    lines = [line for line, _ in body]
+    target = _column(table, headings, body, columns, "target")
+    unit = LENGTHS[columns.target.unit]
+    value = _column(table, headings, body, columns, "measured" if columns.measured else "deviation")
+    deviation, resolution, quantity = _deviations(columns, value, target)
+    way, noted = _directions(table.file, headings, body, columns, target[0] * unit, lines)
+    return Content(
+        name=name,
+        form="table",
+        sha256=digest(data),
+        machine="",
+        said={"Columns": ", ".join(headings)} | {"Rows": str(len(body))},
+        test=AxisReadings(
+            quantity=quantity,
+            axis=axis_of(columns.axis),
+            position_mm=target[0] * unit,
+            direction=way,
+            deviation=deviation,
+            resolution=resolution,
+            t_s=_times(table, headings, body, columns),
+            further=_further(table, headings, body, columns),
+        ),
+        notes=(noted,) if noted else (),
+    )
+
+
+Body = Sequence[tuple[int, list[str]]]
+Numbers = tuple[F1, list[str]]
+
+
+def _index(table: Rows, headings: list[str], line: int, wanted: str | int) -> int:
+    if isinstance(wanted, int):
+        if not 1 <= wanted <= len(headings):
+            raise table.file.wrong(line, f"there is no column {wanted}, the row has {len(headings)}")
+        return wanted - 1
+    if headings.count(wanted) != 1:
+        found = "two columns" if wanted in headings else "no column"
+        raise table.file.wrong(line, f"{found} {wanted!r}; headings are {', '.join(headings)[:200]}")
+    return headings.index(wanted)
+
+
+def _column(table: Rows, headings: list[str], body: Body, columns: ColumnFile, name: str) -> Numbers:
+    one: Measured = getattr(columns, name)
+    k = _index(table, headings, columns.heading or 1, one.column)
+    words = []
+    for line, cells in body:
+        if len(cells) <= k:
+            raise table.file.wrong(line, f"{len(cells)} cells, {name.replace('_', ' ')} is in column {k + 1}")
+        words.append(_plain(table.file, line, cells[k], columns.decimal))
+    return np.array([table.file.number(line, w, name.replace("_", " ")) for (line, _), w in zip(body, words, strict=True)]), words
+
+
+def _plain(file: TextFile, line: int, word: str, decimal: str) -> str:
+    word = word.strip()
+    if decimal == "." or not file.text:  # the cells of a workbook are numbers
+        return word
+    if "." in word:
+        raise file.wrong(line, f"{word!r} has a point, but the decimal sign is a comma")
+    return word.replace(",", ".")
+
+
+def _deviations(columns: ColumnFile, value: Numbers, target: Numbers) -> tuple[F1, float, str]:
+    """Deviations in mm or rad, their step, and the quantity."""
+    if columns.deviation is not None:
+        unit = (LENGTHS | ANGLES)[columns.deviation.unit]
+        return value[0] * unit, step_of(value[1], unit), "angle" if columns.deviation.unit in ANGLES else "length"
+    assert columns.measured is not None
+    unit = LENGTHS[columns.measured.unit]
+    return value[0] * unit - target[0] * LENGTHS[columns.target.unit], step_of(value[1], unit), "length"
+
+
+def _directions(file: TextFile, headings: list[str], body: Body, columns: ColumnFile, target: F1, lines: list[int]) -> tuple[F1, str]:
+    """Direction of each approach, and a note on where it comes from."""
+    if columns.direction is not None:
+        k = _index(Rows(file, list(body)), headings, columns.heading or 1, columns.direction.column)
+        words = {columns.direction.plus: 1.0, columns.direction.minus: -1.0}
+        for line, cells in body:
+            if len(cells) <= k or cells[k].strip() not in words:
+                found = cells[k].strip() if len(cells) > k else "missing"
+                raise file.wrong(line, f"the direction is {found!r}, expected {columns.direction.plus!r} or {columns.direction.minus!r}")
+        return np.array([words[cells[k].strip()] for _, cells in body]), ""
+    step = np.sign(np.diff(target))
+    for k in range(1, step.size):
+        if step[k] == 0.0 == step[k - 1]:
+            raise file.wrong(lines[k + 1], f"target {target[k + 1]:g} mm three times in a row: the order does not say the direction")
+    if not step.any():
+        raise file.wrong(lines[0], "all targets are the same: the order does not say the direction")
+    # The first reading, and the second one at a turning point, belong to the way that follows.
+    way = np.concatenate([[0.0], step])
+    for k in reversed(range(way.size)):
+        if way[k] == 0.0:
+            way[k] = way[k + 1] if k + 1 < way.size else -way[k - 1]
+    return way, "the table has no column of the direction: the order of the targets decided it"
+
+
+def _times(table: Rows, headings: list[str], body: Body, columns: ColumnFile) -> F1 | None:
+    if columns.time is None:
+        return None
+    t = _column(table, headings, body, columns, "time")[0] * TIMES[columns.time.unit]
+    back = np.flatnonzero(np.diff(t) < 0.0)
+    if back.size:
+        raise table.file.wrong(body[int(back[0]) + 1][0], "the time goes back")
+    return t
+
+
+def _further(table: Rows, headings: list[str], body: Body, columns: ColumnFile) -> dict[str, F1]:
+    names = {"scale_temperature": f"temp_{columns.axis.lower()}_C", "air_temperature": "temp_air_C", "air_pressure": "pressure_air_Pa"}
+    out = {}
+    for name, column in names.items():
+        one: Measured | None = getattr(columns, name)
+        if one is not None:
+            values = _column(table, headings, body, columns, name)[0]
+            values = values + TEMPERATURES[one.unit] if one.unit in TEMPERATURES else values * PRESSURES[one.unit]
+            low, high = (COLDEST_C, WARMEST_C) if one.unit in TEMPERATURES else POSSIBLE_PA
+            odd = np.flatnonzero((values < low) | (values > high))
+            if odd.size:
+                what = f"{name.replace('_', ' ')} is {values[odd[0]]:g}, expected {low:g} to {high:g}: is the unit {one.unit}?"
+                raise table.file.wrong(body[int(odd[0])][0], what)
+            out[column] = values
+    return out
+
+
+def guesses(headings: Sequence[str]) -> Iterator[tuple[str, str]]:
+    """Which heading probably is which column of a `ColumnFile`, by common words."""
+    words = {
+        "target": r"target|nominal|position|pos|soll",
+        "deviation": r"deviation|error|dev|fehler|abweichung",
+        "measured": r"measured|actual|reading|ist",
+        "direction": r"direction|dir|richtung",
+        "time": r"time|zeit",
+    }
+    for name, pattern in words.items():
+        found = next((one for one in headings if re.search(rf"(?<![A-Za-z])(?:{pattern})(?![A-Za-z])", one, re.IGNORECASE)), None)
+        if found is not None:
+            yield name, found
