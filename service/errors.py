@@ -341,6 +341,12 @@ class CaptureConflict(AbbeError):
     code = "CAP-003"
 
 
+class AlarmRefused(AbbeError):
+    """An alarm cannot be acknowledged or shelved like this. Nothing was recorded."""
+
+    code = "ALM-010"
+
+
 class PasswordRefused(AbbeError):
     """The new password is too easy to guess."""
 

@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -32,6 +32,7 @@ from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AlarmKind
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
@@ -44,6 +45,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.users.people import Passwords, People
+from abbe.service.verification.alarm_states import Signal
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.logtail import LogTail
@@ -127,6 +129,7 @@ def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: 
             # Before the proposals: what is written afterwards supersedes them.
             aside.submit(lambda: asyncio.run(_pushes(store, machine, evil))).result()
         proposals = _proposals(store, site, runs, solved, campaign, solution, evil)
+        add_alarms(store, machine, schedules[0], proposals[-1], evil)
         return Filled(url, machine, schedules, devices, campaign, solution, proposals, _discovery(store, folder / "c1", evil))
 
 
@@ -145,6 +148,20 @@ def _checks(store: Store, machine: str, schedule: Schedule, count: int, evil: st
         told = Result(verdict, values, text=f"{verdict}: worst body diagonal {drift:.1f} µm{evil}", started_utc=at, duration_s=312.0,
                       campaign=f"quick-check {week}{evil}")  # fmt: skip
         store.verifications.add_with_messages(number, record.check_doc(occasion, told), [])
+
+
+def add_alarms(store: Store, machine: str, schedule: Schedule, proposal: int, evil: str = "") -> None:
+    """One that is over and that nobody has seen, and one that is active, with a proposal."""
+    check = store.verifications.latest(limit=1)[0]
+    values = check.doc["values"]
+    signals = [Signal("body_diagonal_um", "limit", values["body_diagonal_um"], 1.1, 20.0, f"worst body diagonal is above its limit{evil}"),
+               Signal("helix_rms_um", "jump", values["helix_rms_um"], 0.2, 5.0, "helix rms differs", 2.1, 0.1)]  # fmt: skip
+    head = {"recipe": schedule.recipe, "schedule": schedule.name, "verification": check.id, "text": f"above its limit{evil}"}
+    for number, kinds in ((1, ("raised", "cleared")), (2, ("raised",))):
+        for seq, kind in enumerate(kinds):
+            told = [asdict(signal) for signal in signals[::-1][number - 1 :]] if kind == "raised" else []
+            store.alarms.append(machine, None if seq == 0 else number, seq, AlarmKind(kind), head | {"signals": told})
+    store.alarms.append(machine, 2, 1, AlarmKind.PROPOSED, {"proposal": proposal, "text": f"proposal {proposal} waits{evil}"})
 
 
 def _slots(store: Store, machine: str, schedules: list[Schedule], evil: str) -> None:
@@ -275,4 +292,4 @@ def screens(filled: Filled) -> list[str]:
     found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=2&run=3"]
     plant = ["/fleet", "/devices", "/settings"]
     first = ["/", "/new", "/runs", *runs, "/results", "/discoveries", *found]
-    return [*first, "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]
+    return [*first, "/alarms", "/alarm?id=1", "/alarm?id=2", "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]

@@ -10,12 +10,13 @@ from abbe.service.domain.measured import Owner
 
 
 class AlarmKind(StrEnum):
-    """Kind of an entry. The first four change the alarm itself, the others record the service's work on it."""
+    """Kind of an entry. The first five change the alarm itself, the others record the service's work on it."""
 
     RAISED = "raised"
     CONTINUED = "held"
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
+    SHELVED = "shelved"
     BEGUN = "begun"
     MEASURED = "measured"
     DISCOVERED = "discovered"

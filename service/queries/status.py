@@ -44,7 +44,12 @@ class AlarmWork:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmSummary:
-    """An alarm for people. ``signals``: figures of the last check that raised or held it; ``outcome``: latest result of the work on it."""
+    """An alarm for people.
+
+    ``signals``: figures of the last check that raised or held it; if it is over, of the one that raised it. ``priority``: as of `Alarm`;
+    ``comment``: of the person who acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past; ``outcome``: latest result of
+    the work on it.
+    """
 
     alarm: int
     state: Literal["raised", "acknowledged", "cleared", "closed"]
@@ -53,13 +58,20 @@ class AlarmSummary:
     text: str
     signals: Sequence[Signal]
     verification: int
+    priority: int
     raised_utc: datetime
     acknowledged_by: str = ""
     acknowledged_utc: datetime | None = None
+    comment: str = ""
     cleared_utc: datetime | None = None
+    shelved_until_utc: datetime | None = None
     outcome: str = ""
     work: Sequence[AlarmWork] = ()
     proposal: int | None = None
+
+    def is_shelved(self, now: datetime) -> bool:
+        """Whether a person shelved it until a later time than ``now``."""
+        return self.shelved_until_utc is not None and self.shelved_until_utc > now
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -218,12 +230,15 @@ def _alarm(one: Alarm) -> AlarmSummary:
         recipe=one.recipe,
         schedule=one.schedule,
         text=one.text,
-        signals=one.signals,
+        signals=one.signals or one.first,
         verification=one.verification,
+        priority=one.priority,
         raised_utc=datetime.fromisoformat(one.raised_utc),
         acknowledged_by=one.acknowledged_by,
         acknowledged_utc=_time(one.acknowledged_utc),
+        comment=one.comment,
         cleared_utc=_time(one.cleared_utc),
+        shelved_until_utc=_time(one.shelved_until_utc),
         outcome=one.outcome,
         work=[AlarmWork(kind=s.kind, utc=datetime.fromisoformat(s.utc), text=str(s.doc.get("text", ""))) for s in one.work],
         proposal=None if proposed is None else proposed.doc.get("proposal"),

@@ -2,7 +2,8 @@
 
 An alarm belongs to one recipe of one machine and follows from its append-only lines (`AlarmEntryRecord`). A check with a signal raises it,
 every check that does not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not).
-Acknowledging is independent: a cleared alarm remains visible until a person acknowledges it.
+Acknowledging is independent: a cleared alarm remains visible until a person acknowledges it. A person may shelve an alarm for a limited
+time, in which it does not ask for attention (ISA-18.2, IEC 62682).
 """
 
 from __future__ import annotations
@@ -24,6 +25,8 @@ OF_WORK = (
     AlarmKind.PUSHING,
     AlarmKind.PUSHED,
 )
+PRIORITIES: tuple[frozenset[str], ...] = (frozenset({"limit"}), frozenset({"jump"}))
+"""Kinds of signals of the first and the second priority; the third has any other."""
 TRIES = 2
 """Failures of a step, or unfinished campaigns, after which a person takes over."""
 NO_ALARM = 0
@@ -64,7 +67,11 @@ class FiredRule:
 
 @dataclass(frozen=True, slots=True)
 class Alarm:
-    """An alarm after all its lines. ``signals``: of the last check that raised or held it; ``first``: of the check that raised it."""
+    """An alarm after all its lines.
+
+    ``signals``: of the last check that raised or held it; ``first``: of the check that raised it; ``comment``: of the person who
+    acknowledged it; ``shelved_until_utc``: empty if nobody shelved it.
+    """
 
     number: int
     recipe: str
@@ -80,7 +87,9 @@ class Alarm:
     judged_seq: int = 0
     acknowledged_by: str = ""
     acknowledged_utc: str = ""
+    comment: str = ""
     cleared_utc: str = ""
+    shelved_until_utc: str = ""
     work: tuple[AlarmEntryRecord, ...] = field(default=())
 
     @property
@@ -89,6 +98,12 @@ class Alarm:
         if self.active:
             return "acknowledged" if self.acknowledged_by else "raised"
         return "closed" if self.acknowledged_by else "cleared"
+
+    @property
+    def priority(self) -> Literal[1, 2, 3]:
+        """1: a limit is exceeded by more than U; 2: a figure jumped; 3: a figure drifts, or a limit may be reached soon."""
+        kinds = {signal.kind for signal in self.signals or self.first}
+        return 1 if kinds & PRIORITIES[0] else 2 if kinds & PRIORITIES[1] else 3
 
     def last(self, *kinds: AlarmKind) -> AlarmEntryRecord | None:
         """The last line of one of these kinds."""
@@ -147,7 +162,10 @@ def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
     d, kind = line.doc, line.kind
     alarm = replace(alarm, last_seq=line.seq, changed_utc=line.utc)
     if kind is AlarmKind.ACKNOWLEDGED:
-        return alarm if alarm.acknowledged_by else replace(alarm, acknowledged_by=d["name"], acknowledged_utc=line.utc)
+        known = replace(alarm, acknowledged_by=d["name"], acknowledged_utc=line.utc, comment=str(d.get("comment", "")))
+        return alarm if alarm.acknowledged_by else known
+    if kind is AlarmKind.SHELVED:
+        return replace(alarm, shelved_until_utc=d["until_utc"])
     if kind in OF_WORK:
         return replace(alarm, work=(*alarm.work, line))
     if not alarm.active:

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 
 import numpy as np
 
 from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, jumps, mean_of
+from abbe.service.clock import utc_text
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
-from abbe.service.errors import NotStored, StoreError
+from abbe.service.errors import AlarmRefused, NotStored
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, after_check, folded
@@ -95,20 +96,43 @@ def alarms_of(store: Store, machine: str) -> list[Alarm]:
     return folded(store.alarms.entries(machine))
 
 
-def acknowledge(store: Store, machine: str, number: int, name: str) -> Alarm:
-    """Record that a person acknowledged an alarm.
+LONGEST_SHELF = timedelta(days=7)
+
+
+def acknowledge(store: Store, machine: str, number: int, name: str, comment: str = "") -> Alarm:
+    """Record that a person acknowledged an alarm, with an optional comment.
 
     Raises
     ------
     NotStored
         The alarm does not exist.
-    StoreError
+    AlarmRefused
         The alarm is already acknowledged.
     """
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
-        raise StoreError(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
-    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name})
+        raise AlarmRefused(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
+    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name, "comment": comment})
+    return alarm_numbered(store, machine, number)
+
+
+def shelve(store: Store, machine: str, number: int, name: str, reason: str, hours: float) -> Alarm:
+    """Record that a person shelves an alarm for some hours, with the reason; 0 hours end the shelving.
+
+    Raises
+    ------
+    NotStored
+        The alarm does not exist.
+    AlarmRefused
+        The reason is missing, the time is longer than `LONGEST_SHELF`, or the alarm is over and acknowledged.
+    """
+    one, time = alarm_numbered(store, machine, number), timedelta(hours=hours)
+    if one.word == "closed":
+        raise AlarmRefused(f"alarm {number} is over and acknowledged", "there is nothing to shelve")
+    if not timedelta() <= time <= LONGEST_SHELF or (hours > 0 and not reason.strip()):
+        raise AlarmRefused("to shelve an alarm needs a reason and a time", f"at most {LONGEST_SHELF.days} days")
+    doc = {"name": name, "reason": reason.strip(), "until_utc": utc_text(store.utcnow() + time)}
+    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.SHELVED, doc)
     return alarm_numbered(store, machine, number)
 
 

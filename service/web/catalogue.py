@@ -50,6 +50,7 @@ STATUS: dict[type[AbbeError], int] = {
     errors.KeyReused: 409,
     errors.KeyInUse: 409,
     errors.Unusable: 409,
+    errors.AlarmRefused: 409,
     errors.TableRefused: 409,
     errors.FileFormatError: 409,
     errors.MeasurementFault: 409,

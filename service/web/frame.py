@@ -32,6 +32,7 @@ CHOICES: Mapping[str, tuple[str, Collection[str]]] = {
 Screen = tuple[str, str, Permission, tuple[str, ...]]
 SCREENS: tuple[Screen, ...] = (
     ("/", "nav.home", Permission.READ, ("/",)),
+    ("/alarms", "nav.alarms", Permission.READ, ("/alarms", "/alarm")),
     ("/live", "nav.live", Permission.READ, ("/live", "/new")),
     ("/runs", "nav.runs", Permission.READ, ("/runs", "/run", "/compare")),
     ("/results", "nav.results", Permission.READ, ("/results", "/result", "/volume", "/whatif", "/budget")),

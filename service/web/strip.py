@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.queries.status import AlarmSummary, Status
 from abbe.service.sequences.control import State
+from abbe.service.verification.alarm_states import Signal
+from abbe.service.web import language
 from abbe.service.web.frame import current
 
 SIGNS = {State.PAUSED: "‖", State.PAUSING: "‖", State.SUSPENDED: "‖", State.STOPPING: "■", State.ABORTING: "■", "asking": "◆"}
@@ -17,7 +19,8 @@ SIGNS = {State.PAUSED: "‖", State.PAUSING: "‖", State.SUSPENDED: "‖", Stat
 class Strip:
     """Content of the status bar: shape, words and style (``calm``, ``busy``, ``bad``) of the state, and the alarms.
 
-    ``alarms``: number of open alarms; ``first``: the one for the line below the bar; ``attention``: what needs a person now.
+    ``alarms``: number of open alarms that are not shelved; ``first``: the unseen one for the line below the bar, ``line``: its text;
+    ``attention``: what needs a person now.
     """
 
     sign: str
@@ -27,6 +30,7 @@ class Strip:
     job: RunningCheck | None = None
     alarms: int = 0
     first: AlarmSummary | None = None
+    line: str = ""
     attention: str = ""
 
 
@@ -35,11 +39,34 @@ def strip_of(status: Status | None) -> Strip:
     frame = current()
     if status is None:
         return Strip("?", frame.translate("strip.unknown"), "bad")
-    waiting = [one for one in status.alarms if one.state in {"raised", "cleared"}]
-    first = min(waiting, key=lambda one: (one.state != "raised", -one.alarm), default=None)
+    asking = [one for one in status.alarms if not one.is_shelved(status.now_utc)]
+    unseen = [one for one in asking if one.state in {"raised", "cleared"}]
+    first = min(unseen, key=lambda one: (one.state != "raised", one.priority, -one.alarm), default=None)
     sign, text, kind = _state(status)
     attention = next(iter(status.attention), "")
-    return Strip(sign, text, kind, status.machine, status.job, len(status.alarms), first, attention)
+    return Strip(sign, text, kind, status.machine, status.job, len(asking), first, "" if first is None else alarm_line(first), attention)
+
+
+def alarm_line(one: AlarmSummary) -> str:
+    """What raised or held an alarm, or what it was raised for, in the reader's words and units."""
+    return "; ".join(_signal(signal) for signal in one.signals) or one.text
+
+
+def _signal(one: Signal) -> str:
+    frame = current()
+    name, unit = language.figure(frame.lang, one.figure)
+    value, u = frame.with_u(one.value, one.expanded / 2.0, unit)
+    change = "" if one.baseline is None else frame.length(one.value - one.baseline, unit)
+    known = {
+        "figure": name,
+        "value": value,
+        "u": u,
+        "unit": frame.unit(unit),
+        "limit": frame.length(f"{one.limit:g}", unit),
+        "change": change,
+    }
+    text = frame.state("alarm.signal", one.kind)
+    return text.format(**known) if text != one.kind else one.text
 
 
 def _state(status: Status) -> tuple[str, str, str]:

@@ -258,7 +258,7 @@ def test_keyboard_language_and_first_paint(chromium, running) -> None:
     with context(chromium) as made:
         page = made.new_page()
         log_in(page, running.base, "vera")
-        assert page.locator(".screens a").count() == 11, "a viewer is not led to the audit, nor to diagnostics"
+        assert page.locator(".screens a").count() == 12, "a viewer is not led to the audit, nor to diagnostics"
         page.goto(f"{running.base}/")
         page.keyboard.press("Tab")
         assert page.evaluate("document.activeElement.className") == "skip"

@@ -6,9 +6,10 @@ import asyncio
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, tzinfo
-from typing import TypeVar
+from typing import Annotated, TypeVar
 from zoneinfo import ZoneInfo
 
+from fastapi import Query
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
@@ -16,12 +17,15 @@ from abbe.service.errors import NotStored
 from abbe.service.queries.reader import Reader, storable
 from abbe.service.queries.status import Status, StatusSource
 from abbe.service.report.report_parts import Rules
+from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.storage.store import Store
 from abbe.service.web import formatting
 from abbe.service.web.login.authentication import Authenticator
 from abbe.service.web.strip import strip_of
 
 T = TypeVar("T")
+Number = Annotated[int | None, Query(ge=1, le=LARGEST)]
+"""Number of an object in the query of a screen; None: the newest."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,14 +12,13 @@ from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
-from abbe.service.web.pages.context import PageContext, find_or_none
+from abbe.service.web.pages.context import Number, PageContext, find_or_none
 from abbe.service.web.pages.results import solution_lines
 from abbe.service.web.pages.runs import compare_screen
 from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
 from abbe.service.web.pages.whatif import whatif_screen
 
 LARGEST = 2**31 - 1
-Number = Annotated[int | None, Query(ge=1, le=LARGEST)]
 Names = Annotated[list[Annotated[str, Query(max_length=12)]], Query(max_length=30)]
 Runs = Annotated[list[Annotated[int, Query(ge=1, le=LARGEST)]], Query(max_length=20)]
 Plane = Literal["XY", "XZ", "YZ"]

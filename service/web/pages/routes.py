@@ -22,7 +22,7 @@ from abbe.service.web.bodies import form_of
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.pages import times
-from abbe.service.web.pages.context import PageContext, can_be_stored, find_or_none
+from abbe.service.web.pages.context import Number, PageContext, can_be_stored, find_or_none
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
@@ -47,7 +47,6 @@ def themed(rules: str) -> str:
 
 LONGEST_FORM = 1024
 HOURS = (1.0, 8.0, 24.0, 72.0)
-Number = Annotated[int | None, Query(ge=1, le=2**31 - 1)]
 Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
 

@@ -63,7 +63,8 @@ let shownBar = "";
 
 async function showBar(status) {
   setText("strip-left", status.job ? left(status.job.eta_s) : "");
-  const next = JSON.stringify([status.revision, status.job?.state, status.job?.stage, status.job?.step, status.devices.map((one) => one.state)]);
+  const shelved = status.alarms.map((one) => Date.parse(one.shelved_until_utc ?? "") > Date.parse(status.now_utc));
+  const next = JSON.stringify([status.revision, status.job?.state, status.job?.stage, status.job?.step, status.devices.map((one) => one.state), shelved]);
   if (next === shownBar) return;
   const answer = await ask("/strip", false);
   if (!answer.ok) return;

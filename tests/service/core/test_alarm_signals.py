@@ -20,7 +20,7 @@ from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmKind
-from abbe.service.errors import StoreError
+from abbe.service.errors import AlarmRefused, StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS
 from abbe.service.queries.status import alarms
@@ -178,7 +178,7 @@ async def test_raised_held_acknowledged_cleared_with_messages_and_audit(bench: B
     (one,) = alarms(bench.store, "mill-7")
     assert (one.state, [s.kind for s in one.signals]) == ("raised", ["limit", "jump"])
     assert acknowledge(bench.store, "mill-7", 1, "otto").word == "acknowledged"
-    with pytest.raises(StoreError, match="was acknowledged by otto"):
+    with pytest.raises(AlarmRefused, match="was acknowledged by otto"):
         acknowledge(bench.store, "mill-7", 1, "anna")
     assert (await bench.check(result(3, 9.1))).startswith("alarm 1 cleared")
     assert alarms(bench.store, "mill-7") == []

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import pytest
@@ -125,6 +125,21 @@ def test_a_restart_anywhere_finds_the_same(acts: list[FiredRule | str], cut: int
         then.append((len(book.lines), book.alarms))
     for length, alarms in then[:cut]:
         assert folded(book.lines[:length]) == alarms
+
+
+def test_priority_comment_and_shelving(raised: Book) -> None:
+    assert raised.alarms[0].priority == 1
+    jump, drift = (FiredRule(True, "pass", (replace(SIGNAL, kind=kind),)) for kind in ("jump", "drift"))
+    raised.check(jump)
+    assert raised.alarms[0].priority == 2
+    raised.check(drift)
+    assert raised.alarms[0].priority == 3
+    raised.check(GOOD)
+    assert raised.alarms[0].priority == 1, "what is over keeps the priority that it was raised with"
+    raised.add(1, AlarmKind.SHELVED, name="otto", reason="spindle is being repaired", until_utc="2026-11-23T00:00:00Z")
+    raised.add(1, AlarmKind.ACKNOWLEDGED, name="otto", comment="seen")
+    (one,) = raised.alarms
+    assert (one.shelved_until_utc, one.comment, one.word) == ("2026-11-23T00:00:00Z", "seen", "closed")
 
 
 def test_lines_that_cannot_follow_are_left_out() -> None:

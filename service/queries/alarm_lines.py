@@ -1,0 +1,40 @@
+"""The history of an alarm for people: every entry with the person behind it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.storage.store import Store
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmLine:
+    """One entry of an alarm. ``who``: the person, empty for the service; ``verification``, ``until_utc``: None if the entry has none."""
+
+    kind: AlarmKind
+    utc: datetime
+    who: str
+    text: str
+    verification: int | None = None
+    until_utc: datetime | None = None
+
+
+def alarm_lines(store: Store, machine: str, number: int) -> list[AlarmLine]:
+    """The entries of an alarm, newest first."""
+    return [_line(one) for one in reversed(store.alarms.entries(machine)) if one.alarm == number]
+
+
+def _line(one: AlarmEntryRecord) -> AlarmLine:
+    doc = one.doc
+    text = next((str(doc[key]) for key in ("text", "comment", "reason") if doc.get(key)), "")
+    until = doc.get("until_utc")
+    return AlarmLine(
+        kind=one.kind,
+        utc=datetime.fromisoformat(one.utc),
+        who=str(doc.get("name", "")),
+        text=text,
+        verification=doc.get("verification"),
+        until_utc=None if until is None else datetime.fromisoformat(until),
+    )
