@@ -8,9 +8,9 @@ import sys
 import structlog
 
 
-def configure_logs() -> None:
-    """Log to stderr: one JSON object a line for machines, readable lines in a terminal."""
-    terminal = sys.stderr.isatty()
+def configure_logs(*, as_json: bool = False) -> None:
+    """Log to stderr: one JSON object a line for machines, readable lines in a terminal (not with ``as_json``)."""
+    terminal = sys.stderr.isatty() and not as_json
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,
         structlog.stdlib.add_log_level,

@@ -205,17 +205,26 @@ def print_table(headings: Sequence[str], rows: Iterable[Sequence[str]], title: s
     console.print(table)
 
 
-def conclude(then: str, *, machine: Path | None = None, db: str | None = None, verdict: str = "") -> None:
-    """Tell people the verdict and the next command, on stderr: stdout holds the answer alone.
+def answer(doc: Any, *lines: str, as_json: bool) -> None:
+    """Write the answer of a command to stdout: ``doc`` as JSON for programs, or the lines for people."""
+    if as_json:
+        print_json(doc)
+        return
+    for line in lines:
+        typer.echo(line)
+
+
+def conclude(then: str, *, machine: Path | None = None, db: str | None = None, verdict: str = "", as_json: bool = False) -> None:
+    """Tell people the verdict and the next command, on stderr: stdout holds the answer alone. With ``as_json``, tell nothing.
 
     ``machine`` and ``db``, as they were given, are repeated in the next command.
     """
     from abbe.service.secrets import mask_secrets, visible
 
+    if as_json or sys.stderr is None:
+        return
     named = "" if machine is None else f" -m {shlex.quote(str(machine))}"
     named += "" if db is None else f" --db {shlex.quote(mask_secrets(db))}"
-    if sys.stderr is None:
-        return
     sys.stdout.flush()
     for line in filter(None, (verdict, f"next: {then}{named}")):
         sys.stderr.write(visible(line) + "\n")

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
-import sys
 import tempfile
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+
+from abbe.service.cli.common import JsonOption, conclude, print_json
 
 if TYPE_CHECKING:
     from collections.abc import Iterator
@@ -24,7 +24,7 @@ DEFAULT_FOLDER = "abbe-demo"
 def demo(
     seed: Annotated[int, typer.Option(help="Which simulated machine.")] = 1,
     speed: Annotated[float, typer.Option(min=1.0, max=200.0, help="Machine seconds per wall second.")] = 60.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")] = False,
+    as_json: JsonOption = False,
     keep: Annotated[Path | None, typer.Option(help="Folder for database, machine file, tables and report.")] = None,
     hidden: Annotated[
         int | None,
@@ -63,10 +63,11 @@ def demo(
     report = folder / "report.html"
     write_document(demo_report(result), report)
     if as_json:
-        sys.stdout.write(json.dumps(demo_json(result), indent=2) + "\n")
+        print_json(demo_json(result))
     else:
         print_result(Console(), result)
     Console(stderr=True).print(f"report: {report}")
+    conclude("abbe demo --hidden 4" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
 
 
 def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:
@@ -87,11 +88,12 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
     # The report leaves out the truth, which nobody knows of a real machine.
     write_document(found_report(result.job, result.journal, result.finding, result.started_utc), report)
     if as_json:
-        sys.stdout.write(json.dumps({"seed": seed, "speed": speed} | hidden_json(result), indent=2) + "\n")
+        print_json({"seed": seed, "speed": speed} | hidden_json(result))
     else:
         for line in summary_lines(result):
             typer.echo(line)
     Console(stderr=True).print(f"report: {report}")
+    conclude("abbe demo --hidden 4" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
 
 
 def _folder(keep: Path | None) -> Path:

@@ -6,7 +6,8 @@ import functools
 import inspect
 import io
 import re
-from contextlib import redirect_stdout
+from collections.abc import Iterator
+from contextlib import contextmanager, redirect_stdout
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -57,24 +58,27 @@ def _with_out(work: Any) -> Any:
 
     @functools.wraps(work)
     def around(out: Path | None = None, **given: Any) -> Any:
-        if out is None:
+        with answer_into(out):
             return work(**given)
-        text = io.StringIO()
-        try:
-            with redirect_stdout(text):
-                result = work(**given)
-        except typer.Exit:  # an answer, too
-            _write(text, out)
-            raise
-        _write(text, out)
-        return result
 
     added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=OutOption)
     around.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
     return around
 
 
-def _write(text: io.StringIO, out: Path) -> None:
+@contextmanager
+def answer_into(out: Path | None) -> Iterator[None]:
+    """Collect what is written to stdout, and write it to a file when the work has ended with an answer; None: leave it alone."""
+    if out is None:
+        yield
+        return
     from abbe.service.rendering.page_file import write_page
 
+    text = io.StringIO()
+    try:
+        with redirect_stdout(text):
+            yield
+    except typer.Exit:  # an answer, too
+        write_page(text.getvalue(), out)
+        raise
     write_page(text.getvalue(), out)

@@ -5,25 +5,27 @@
 
 from __future__ import annotations
 
-import math
 from contextlib import asynccontextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from shlex import quote
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import MachineOption, machine_file, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file
+from abbe.service.cli.form import answer_into
+from abbe.service.cli.rehearsal import Rehearsal
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
+    from abbe.service.compensation.correct import Correction
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
     from abbe.service.domain.progress import ProgressSink
     from abbe.service.domain.run import Run
-    from abbe.service.sequences.check import DryRun
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.recipes.campaigns import RecipeSource
     from abbe.service.sequences.steps import CampaignPlan
@@ -47,59 +49,78 @@ def measure(  # noqa: PLR0913 - one argument for each option
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would move and how long it takes; move nothing.")] = False,
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.html", help="With --dry-run: a page with the paths in three views.")] = None,
-    nc: Annotated[str, typer.Option(help="Write an NC program: siemens, fanuc, heidenhain, linuxcnc or iso; with --out.")] = "",
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where --nc writes.")] = None,
+    nc: Annotated[str, typer.Option(help="Write an NC program to --out: siemens, fanuc, heidenhain, linuxcnc or iso.")] = "",
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where the NC program, or without --nc the answer goes.")] = None,
     resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is in the store.")] = "",
     untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: the mounted instruments were not touched.")] = False,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
     from abbe.service.campaigns.resume import begun_source
-    from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.sequences.check import dry_run_campaign, paced
-    from abbe.service.sequences.control import Control
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
-    rehearsal = Rehearsal(dry_run, path, picture, nc, out)
-    file = machine_file(machine)
+    rehearsal, file = Rehearsal(dry_run, path, picture, nc, out), machine_file(machine)
     instead = rehearsal.check((file, Path(recipe)))
     loaded = load_machine(file)
-    site = site_of(loaded.machine)
-    source = _source(recipe, helix, rate_hz)
+    site, source = site_of(loaded.machine), _source(recipe, helix, rate_hz)
     if resume:
         with Store.open(loaded.database_url) as store:
             store.campaigns.find(resume)
             source = source if recipe or helix else begun_source(store, resume)
     plan = source.plan(site.machine)
-    title = resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}"
-    plan = replace(paced(plan, site.max_feed_mm_min), name=title)
+    plan = replace(paced(plan, site.max_feed_mm_min), name=resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
-    if instead:
-        rehearsal.run(site, plan, runs)
-    if not nc:
-        _warn_before(loaded, site, plan, dry=bool(instead))
-    if instead:
-        warn_of_open_push(loaded.database_url, site)
-        return
-    control, options = Control(), ConsoleOptions(resume=bool(resume), untouched=untouched, accept_table=accept_table)
+    with answer_into(None if nc else out):
+        if instead:
+            rehearsal.run(site, plan, runs, as_json=as_json)
+        if not nc:
+            _warn_before(loaded, site, plan, dry=instead)
+        if instead:
+            warn_of_open_push(loaded.database_url, site)
+            _conclude_rehearsal(source, nc, machine, as_json=as_json)
+            return
+        _measure(loaded, plan, source, ConsoleOptions(resume=bool(resume), untouched=untouched, accept_table=accept_table), as_json=as_json)
+
+
+def _conclude_rehearsal(source: RecipeSource, nc: str, machine: Path | None, *, as_json: bool) -> None:
+    words = f"--helix {source.helix}" if source.helix else f"--recipe {quote(source.recipe)}"
+    conclude(f"abbe {'listen' if nc else 'measure'} {words}", machine=machine, as_json=as_json)
+
+
+def _measure(loaded: LoadedMachine, plan: CampaignPlan, source: RecipeSource, options: ConsoleOptions, *, as_json: bool) -> None:
+    """Measure a plan, judge it if its recipe is a check, and say what comes next."""
+    from abbe.service.cli.running import run_job
+    from abbe.service.clock import SystemClock
+    from abbe.service.sequences.control import Control
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
+
+    site, control = site_of(loaded.machine), Control()
     begun_s = SystemClock().monotonic_s()
     with Store.open(loaded.database_url) as store:
         run_job(_measured(store, site, plan, control, source, options), control)
-        typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
-        if source.recipe in CHECKS and not source.helix:
-            typer.echo(_check(store, loaded.machine, plan.name, source.recipe, begun_s))
+        doc: dict[str, Any] = {"campaign": plan.name, "runs": len(plan.tests), "check": None}
+        lines = [f"measured: campaign {plan.name!r}, {len(plan.tests)} runs"]
+        is_check = source.recipe in CHECKS and not source.helix
+        if is_check:
+            doc["check"], line = _check(store, loaded.machine, plan.name, source.recipe, begun_s)
+            lines.append(line)
+    answer(doc, *lines, as_json=as_json)
+    conclude(f"abbe {'report' if is_check else 'solve'} {quote(plan.name)}", machine=loaded.path, as_json=as_json)
 
 
 CHECKS = ("quick-check", "verification")
 """Built-in recipes that end with a verdict, as scheduled checks do."""
 
 
-def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_s: float) -> str:
-    """Judge the measured runs and store them as a check that began with its campaign; return a line for the console."""
+def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_s: float) -> tuple[dict[str, Any], str]:
+    """Judge the measured runs and store them as a check that began with its campaign; return it for programs, and as a line."""
     from datetime import datetime
 
     from abbe.service.clock import SystemClock
@@ -115,10 +136,10 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
     try:
         result = judged(config, runs, campaign, started, SystemClock().monotonic_s() - begun_s)
     except MeasurementFault as fault:
-        return f"not judged: {fault.detail}"
+        return {"verdict": "not judged", "text": fault.detail}, f"not judged: {fault.detail}"
     doc = check_doc(Occasion(config.name, Schedule("by hand", "", "UTC", recipe), started), result)
     number = store.verifications.add(record.machine_id, record.id, str(doc["verdict"]), doc)
-    return f"check {number}: {result.verdict}: {result.text}"
+    return {"number": number} | doc, f"check {number}: {result.verdict}: {result.text}"
 
 
 def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
@@ -185,10 +206,10 @@ def correct(
     ] = 600.0,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; roll back to the old table if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import rollback_when_safe, run_job
-    from abbe.service.compensation.correct import Correction
     from abbe.service.compensation.correct import correct as work_correct
     from abbe.service.compensation.gate import PushContext, check_preconditions
     from abbe.service.compensation.proposals import check_certificates
@@ -220,14 +241,24 @@ def correct(
         try:
             found = run_job(work(store))
         except TakenBack as error:  # a negative answer, not a fault
-            typer.echo("; ".join([f"rolled back: {error.detail}", *getattr(error, "__notes__", [])]))
+            text = "; ".join([error.detail, *getattr(error, "__notes__", [])])
+            answer({"kept": False, "push": None, "text": text, "not_for_tables": []}, f"rolled back: {text}", as_json=as_json)
+            conclude(f"abbe discover {quote(campaign)}", machine=machine, as_json=as_json)
             raise typer.Exit(1) from None
-    typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
-    for line in found.not_for_tables:
-        typer.echo(f"not in the tables: {line}")
-    for line in filter(None, hints):
-        typer.echo(line)
-    raise typer.Exit(0 if found.decision.keep else 1)
+    say_correction(found, hints, machine, as_json=as_json)
+
+
+def say_correction(found: Correction, hints: list[str], machine: Path | None, *, as_json: bool) -> None:
+    """Say whether a pushed table was kept, and exit with code 1 if it was not."""
+    kept = found.decision.keep
+    doc = {"kept": kept, "push": found.pushed.push_id, "text": found.decision.text, "not_for_tables": list(found.not_for_tables)}
+    lines = [
+        ("kept: " if kept else "rolled back: ") + found.decision.text,
+        *(f"not in the tables: {text}" for text in found.not_for_tables),
+    ]
+    answer(doc, *lines, *filter(None, hints), as_json=as_json)
+    conclude(f"abbe report push {found.pushed.push_id}", machine=machine, as_json=as_json)
+    raise typer.Exit(0 if kept else 1)
 
 
 async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[Run]:
@@ -290,6 +321,7 @@ def listen(
     name: Annotated[str, typer.Option(help="Name of the campaign in the store; default: name of the recipe and time.")] = "",
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Record the laser while the operator runs the NC program of a recipe; each standstill of the program becomes a reading."""
     from abbe.service.campaigns.listen import listen_campaign
@@ -310,95 +342,10 @@ def listen(
 
     async def work(store: Store) -> None:
         async with ready_session(store, site, accept_table=accept_table) as session:
-            await listen_campaign(session, store, site, plan, lambda text: typer.echo(text))
+            await listen_campaign(session, store, site, plan, lambda text: typer.echo(text, err=as_json))
 
     with Store.open(loaded.database_url) as store:
         run_job(work(store))
-    typer.echo(f"measured: campaign {plan.name!r}, {len(plan.tests)} runs")
-
-
-HAIR = 1e-6
-"""Tolerance, mm: a position this close to a whole number counts as whole."""
-
-
-@dataclass(frozen=True, slots=True)
-class Rehearsal:
-    """What to do instead of measuring: a dry run, optionally with all positions or a picture, or an NC program in the dialect ``nc``."""
-
-    dry_run: bool
-    path: bool
-    picture: Path | None
-    nc: str
-    out: Path | None
-
-    def check(self, sources: tuple[Path, ...]) -> bool:
-        """Return whether anything is requested instead of a measurement.
-
-        Raises
-        ------
-        ConfigError
-            Two options do not go together, or an output file would overwrite an input.
-        """
-        from abbe.service.errors import ConfigError
-        from abbe.service.rendering.document_page import form_of
-
-        if self.picture is not None and not self.dry_run:
-            raise ConfigError("--picture draws a dry run", "add --dry-run")
-        if self.picture is not None:
-            form_of(self.picture)
-        if self.path and not self.dry_run:
-            raise ConfigError("--path prints the positions of a dry run", "add --dry-run")
-        if bool(self.nc) != (self.out is not None):
-            raise ConfigError("--nc DIALECT and --out FILE go together", "give both")
-        if self.nc and self.dry_run:
-            raise ConfigError("--nc and --dry-run do not go together", "give one of them")
-        for target in (self.picture, self.out):
-            if target is not None and any(target.resolve() == s.resolve() for s in sources):
-                raise ConfigError(f"{target} would be overwritten", "give another file name")
-        return self.dry_run or bool(self.nc)
-
-    def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...]) -> None:
-        """Print or draw the dry run, or write the NC program."""
-        from abbe.service.rendering.document_page import write_document
-        from abbe.service.rendering.page_file import write_page
-        from abbe.service.report.dry_run_page import dry_run_report
-        from abbe.service.sequences.nc.write import nc_program
-
-        if self.nc and self.out is not None:
-            made = nc_program(site.name, site.machine, plan, self.nc, site.nc)
-            write_page(made.text, self.out)
-            typer.echo(f"NC program: {self.out} ({self.nc}), {made.size}; read it before you run it")
-            if made.warning:
-                typer.echo(f"warning: {made.warning}", err=True)
-            return
-        print_path(plan) if self.path else print_dry_run(plan.name, runs)
-        if self.picture is not None:
-            write_document(dry_run_report(site.name, site.machine, plan, runs), self.picture)
-            typer.echo(f"picture: {self.picture}")
-
-
-def print_path(plan: CampaignPlan) -> None:
-    """Print every commanded position of the plan, one CSV line each: test, X, Y, Z in mm."""
-    from abbe.service.sequences.check import positions
-
-    typer.echo("test,x_mm,y_mm,z_mm")
-    for test in plan.tests:
-        for x, y, z in positions(test.steps):
-            typer.echo(f"{test.label},{x:.5f},{y:.5f},{z:.5f}")
-
-
-HEADINGS = ("test", "kind", "s", "mm", "X", "Y", "Z", "mm/min", "points")
-
-
-def print_dry_run(name: str, runs: tuple[DryRun, ...]) -> None:
-    """Print one line per test: time, path, extent, largest speed, readings."""
-    rows = [
-        (r.label, r.test, f"{r.duration_s:.0f}", f"{r.path_mm:.0f}", *_extent(r), f"{r.fastest_mm_min:.0f}", str(r.readings)) for r in runs
-    ]
-    typer.echo(f"{name}: {sum(r.duration_s for r in runs) / 60:.1f} min of machine time, mounting not counted; X, Y, Z in mm")
-    print_table(HEADINGS, rows)
-
-
-def _extent(run: DryRun) -> tuple[str, ...]:
-    """Return lowest and highest position of each axis, rounded outwards to whole mm."""
-    return tuple(f"{math.floor(lo + HAIR)}..{math.ceil(hi - HAIR)}" for lo, hi in zip(run.lowest_mm, run.highest_mm, strict=True))
+    doc = {"campaign": plan.name, "runs": len(plan.tests)}
+    answer(doc, f"measured: campaign {plan.name!r}, {len(plan.tests)} runs", as_json=as_json)
+    conclude(f"abbe solve {quote(plan.name)}", machine=machine, as_json=as_json)

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, conclude, machine_file, print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.campaigns.plan import PlannedCampaign
@@ -54,6 +55,8 @@ def plan(
         print_json(plan_doc(planned))
         return
     _print(planned, out, picture)
+    then = f"abbe plan --minutes {minutes:g} --out plan.toml" if out is None else f"abbe measure --recipe {quote(str(out))} --dry-run"
+    conclude(then, machine=machine)
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
@@ -88,4 +91,4 @@ def _print(planned: PlannedCampaign, out: Path | None, picture: Path | None) -> 
     if picture is not None:
         typer.echo(f"picture: {picture}")
     if out is not None:
-        typer.echo(f"recipe: {out}; run it with `abbe measure -m MACHINE.toml --recipe {out}`")
+        typer.echo(f"recipe: {out}")

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from abbe.service.cli import BAD_INPUT, complain
-from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, conclude, print_json, print_table
 from abbe.service.errors import FileFormatError
 
 if TYPE_CHECKING:
@@ -78,6 +78,7 @@ def papers(
     show_papers(found, Console(highlight=False) if sys.stdout.isatty() else Console(highlight=False, width=WIDTH))
     if html is not None:
         typer.echo(f"report: {html}")
+    conclude("abbe papers --html papers.html" if html is None else "abbe effects")
 
 
 def vectors(
@@ -97,6 +98,7 @@ def vectors(
         print_json(doc)
     else:
         _show_vectors(checked, doc["missing"])
+        conclude("abbe papers")
     bad = [c.error for c in checked if c.error]
     for error in bad:
         complain(FileFormatError.code, error)

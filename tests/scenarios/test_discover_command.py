@@ -29,7 +29,8 @@ def abbe(capsys, tmp_path, monkeypatch):
 
 def test_hidden_backlash_is_named_added_and_the_gap_shrinks_in_a_new_campaign(abbe, tmp_path):
     june = write_case(tmp_path / "june", "june", ROLES)
-    out = abbe("discover", june, "--db", DB, "--json", "a.json", "--report", "a.html")
+    abbe("discover", june, "--json", "--out", "a.json")
+    out = abbe("discover", june, "--db", DB, "--report", "a.html")
     answer = json.loads((tmp_path / "a.json").read_text())
     assert answer["verdict"] == "named"
     assert [f"{e['name']}:{e['key']}" for e in answer["effects"]] == ["backlash:X"]
@@ -53,7 +54,9 @@ def test_hidden_backlash_is_named_added_and_the_gap_shrinks_in_a_new_campaign(ab
 
 
 def test_nothing_is_found_where_nothing_is_hidden(abbe, tmp_path):
-    out = abbe("discover", write_case(tmp_path / "null", "null", ROLES, width_mm=0.0), "--json", "a.json", "--db", DB)
+    null = write_case(tmp_path / "null", "null", ROLES, width_mm=0.0)
+    abbe("discover", null, "--json", "--out", "a.json")
+    out = abbe("discover", null, "--db", DB)
     answer = json.loads((tmp_path / "a.json").read_text())
     assert (answer["verdict"], answer["effects"]) == ("none", [])
     assert "Nothing is missing" in out
@@ -65,7 +68,9 @@ def test_nothing_is_found_where_nothing_is_hidden(abbe, tmp_path):
     ("axis", "words"), [("x", "No common drift"), ("y", "slow drift, alike at all positions, of axis Y"), ("z", "No common drift")]
 )
 def test_real_axis_tests_are_named_where_a_drift_explains_them(abbe, shared, tmp_path, axis, words):
-    out = abbe("discover", shared / "data" / "axis-tests" / f"week42-{axis}", "--json", "a.json", "--report", "a.html", "--db", DB)
+    week = shared / "data" / "axis-tests" / f"week42-{axis}"
+    abbe("discover", week, "--json", "--out", "a.json")
+    out = abbe("discover", week, "--report", "a.html", "--db", DB)
     answer = json.loads((tmp_path / "a.json").read_text())
     assert words in out
     assert [e["name"] for e in answer["effects"]] == (["slow_drift"] if axis == "y" else [])

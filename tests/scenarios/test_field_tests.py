@@ -33,7 +33,7 @@ def test_every_kind_of_test_is_measured_and_solved(abbe, start_sims, tmp_path):
     folder = next((tmp_path / "out").rglob("campaign.json")).parent
     found = {r["run_id"]: r for r in read_folder(folder).run_files}  # and the exchange format takes it back
     if os.environ.get("ABBE_TEST_LONG") == "1":
-        discovered = json.loads(run(abbe, "discover", str(folder), "--json", "-"))
+        discovered = json.loads(run(abbe, "discover", str(folder), "--json"))
         assert discovered["verdict"] in {"none", "named", "unknown"}
     assert {k: found[k]["test"] for k in ("c1", "f1", "p1", "l1")} == {
         "c1": "ballbar_circle", "f1": "laser_diagonal", "p1": "ballbar_helix", "l1": "laser_linear",

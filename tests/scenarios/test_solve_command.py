@@ -60,7 +60,7 @@ def small(tmp_path_factory):
 
 
 def test_a_folder_is_solved_told_and_drawn_and_nothing_is_stored(command, folder, tmp_path):
-    code, out, err = command("solve", folder, "--report", "page.html")
+    code, out, err = command("solve", folder, "--report", "page.html", "--details")
     assert code == 0
     text = " ".join(out.split())
     for words in (
@@ -179,7 +179,7 @@ def test_residuals_are_one_line_per_run(command, folder, tmp_path):
     wave = next(r for r in runs if r["test"] == "ballbar_helix")
     columns = wave["columns"]
     columns["deviation_mm"] = [v + 2e-3 * np.sin(x / 9.0) for v, x in zip(columns["deviation_mm"], columns["x_mm"], strict=True)]
-    code, out, _ = command("solve", write_folder(tmp_path / "wave", site.doc, runs))
+    code, out, _ = command("solve", write_folder(tmp_path / "wave", site.doc, runs), "--details")
     assert code == 0
     lines = out.split("residuals that are not noise:")[1].split("these runs cannot tell")[0].splitlines()
     named = [line.split(":")[0] for line in lines if line.startswith("- ")]

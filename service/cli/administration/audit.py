@@ -14,7 +14,17 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    conclude,
+    database_url,
+    open_store,
+    print_json,
+    print_table,
+    warn_of_readers,
+)
 
 if TYPE_CHECKING:
     from abbe.service.domain.audit_event import AuditEvent
@@ -44,6 +54,7 @@ def show_audit(
     # Escaped here, since `print_table` keeps line breaks: one in a target must not look like another record.
     rows = [tuple(map(visible, (str(r.id), r.utc[:19], r.who, r.action, r.target, r.outcome))) for r in found]
     print_table(("record", "when (UTC)", "who", "what", "on", "outcome"), rows)
+    conclude("abbe audit verify", machine=machine, db=db, verdict=f"the newest {len(rows)} records")
 
 
 @audit.command("verify")
@@ -68,6 +79,7 @@ def verify_audit(db: DbOption = None, machine: MachineOption = None, as_json: Js
         if not faults:
             typer.echo(f"{last[0].id if last else 0} records: none missing, none changed")
             typer.echo(f"head: {head}" if head else "the audit is empty")
+        conclude("abbe audit show" if faults else "abbe backup backup", machine=machine, db=db)
     raise typer.Exit(1 if faults else 0)
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, print_json
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, conclude, database_url, named_machine, print_json
 
 if TYPE_CHECKING:
     from abbe.service.backup.backup import BackupSource
@@ -37,6 +38,8 @@ def backup(
             typer.echo(f"audit: {text}")
         if made.audit.records and not made.audit.key:
             typer.echo("the backup does not contain the audit's key: abbe restore needs it (--audit-key FILE)")
+        then = "abbe audit verify" if made.audit.faults else f"abbe restore {quote(str(target))} --db sqlite:////tmp/restored.sqlite3"
+        conclude(then, machine=machine if made.audit.faults else None, db=db if made.audit.faults else None)
     raise typer.Exit(1 if made.audit.faults else 0)
 
 
@@ -67,6 +70,7 @@ def restore(
         typer.echo(f"{done.segments} files of samples: the next command that connects to the machine stores them in the database")
     for path in aside:
         typer.echo(f"set aside: {path}")
+    conclude("abbe audit verify", machine=machine, db=db)
 
 
 def _source(db: str | None, machine: Path | None) -> BackupSource:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, machine_file, open_store, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, answer, conclude, machine_file, open_store, print_json, print_table
 
 alarm = typer.Typer(help="Alarms of the scheduled checks.", no_args_is_help=True)
 
@@ -31,12 +31,16 @@ def list_alarms(
         return
     if not found:
         typer.echo(f"no alarm of {loaded.machine.name} is open")
+        conclude("abbe trend", machine=machine)
         return
     rows = [
         (str(one.alarm), one.state, one.recipe, f"{one.raised_utc:%Y-%m-%d %H:%M:%S}", one.acknowledged_by, one.text, one.outcome)
         for one in found
     ]
     print_table(("no", "state", "recipe", "raised (UTC)", "acknowledged by", "text", "outcome"), rows)
+    unseen = [one.alarm for one in found if not one.acknowledged_by]
+    then = f"abbe alarm acknowledge {unseen[0]}" if unseen else "abbe trend"
+    conclude(then, machine=machine, verdict=f"{len(found)} alarms of {loaded.machine.name}, {len(unseen)} that nobody has seen")
 
 
 @alarm.command("acknowledge")
@@ -46,6 +50,7 @@ def acknowledge(
         str, typer.Option("--as", metavar="NAME", help="Who has seen the alarm. Default: the account.", show_default=False)
     ] = "",
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Note that a person has seen an alarm. The alarm stays active until a check clears it."""
     from abbe.service.compensation.proposals import login
@@ -55,7 +60,9 @@ def acknowledge(
     loaded = load_machine(machine_file(machine))
     with open_store(loaded.database_url) as store:
         done = work(store, loaded.machine.name, number, name.strip() or login())
-    typer.echo(f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc}")
+    text = f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc}"
+    answer({"alarm": number, "state": done.word, "acknowledged_by": done.acknowledged_by, "text": text}, text, as_json=as_json)
+    conclude("abbe alarm list", machine=machine, as_json=as_json)
 
 
 def fleet(
@@ -80,6 +87,7 @@ def fleet(
         typer.echo("no machine is in this database yet: run abbe serve or abbe measure")
     else:
         print_table(HEADINGS, [row(one) for one in lines])
+    conclude("abbe runs", machine=machine, db=db, verdict=f"{len(lines)} machines", as_json=as_json)
 
 
 def trend(
@@ -113,11 +121,14 @@ def trend(
         typer.echo(f"{known.text}: {measure_now(machine_file(machine))}" if known.state == "unverified" else known.text)
     if not found.figures and known.changes:
         typer.echo(f"no check of {found.machine} has figures since the present table came into force: --after UTC shows older ones")
+        conclude(measure_now(machine_file(machine)))
         return
     if not found.figures:
         typer.echo(f"no check of {found.machine} has figures yet: run abbe serve, or abbe serve --once")
+        conclude("abbe serve --once", machine=machine)
         return
     print_table(HEADINGS, [row(one) for one in found.figures])
+    conclude("abbe alarm list" if known.holds else measure_now(machine_file(machine)), machine=machine if known.holds else None)
 
 
 def _utc(text: str | None) -> datetime | None:

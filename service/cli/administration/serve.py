@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import MachineOption, machine_file
+from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file
 from abbe.service.errors import AbbeError
 
 if TYPE_CHECKING:
@@ -45,6 +45,7 @@ def serve(
         bool, typer.Option("--once", help="Run every recipe of the timetable once, now, and end; exit code 1 unless all pass.")
     ] = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from abbe.service.config import load_machine
@@ -52,8 +53,12 @@ def serve(
     from abbe.service.serve import serve as run
 
     setup = setup_of(load_machine(machine_file(machine)), port)
-    configure_logs()
-    raise typer.Exit(run(setup, once=once))
+    configure_logs(as_json=as_json)
+    code = run(setup, once=once)
+    word = {0: "all checks passed", 1: "not all checks passed"}.get(code, "ended by a fault") if once else "ended"
+    answer({"machine": setup.machine, "exit_code": code, "text": word}, f"{setup.machine}: {word}", as_json=as_json)
+    conclude("abbe trend", machine=machine, as_json=as_json)
+    raise typer.Exit(code)
 
 
 def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:

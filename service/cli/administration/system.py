@@ -13,13 +13,13 @@ from typing import Annotated, Any
 import typer
 
 from abbe.service.children import python_command
-from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
 
 
-def version() -> None:
+def version(as_json: JsonOption = False) -> None:
     """Print the versions of Abbe, Python and SQLite, and whether SQLite may use its write-ahead log."""
     import platform
     import sqlite3
@@ -28,14 +28,16 @@ def version() -> None:
     from abbe.service.storage.engine import wal_is_safe
 
     log = "write-ahead log" if wal_is_safe() else "no write-ahead log: this SQLite has the WAL-reset bug"
-    typer.echo(f"abbe {metadata.version('abbe')} (Python {platform.python_version()}, SQLite {sqlite3.sqlite_version}, {log})")
+    doc = {"abbe": metadata.version("abbe"), "python": platform.python_version(), "sqlite": sqlite3.sqlite_version, "log": log}
+    answer(doc, f"abbe {doc['abbe']} (Python {doc['python']}, SQLite {doc['sqlite']}, {log})", as_json=as_json)
+    conclude("abbe check-config", as_json=as_json)
 
 
 def sim(context: typer.Context) -> None:
     """Run the simulated machine and its instruments; arguments go to the module `abbe.simulators`."""
     # Its own process group: Ctrl-C reaches the child once, from here, and not again from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-    arguments = list(context.args)
+    arguments = [word for word in context.args if word != "--json"]  # it prints nothing else
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:
         # The child ends when this pipe closes, even if this process is killed by SIGKILL.
         arguments.append("--watch-stdin")
@@ -85,16 +87,21 @@ def check_config(
         typer.echo(f"warning: {visible(line)}", err=True)
     for line in found.errors:
         typer.echo(f"error {ConfigError.code}: {visible(line)}", err=True)
+    then = "abbe check-config" if found.errors else "abbe measure --dry-run"
+    conclude(then, machine=machine, verdict=f"{file}: {len(found.errors)} errors, {len(found.warnings)} warnings")
     raise typer.Exit(2 if found.errors else 0)
 
 
-def schema(folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")] = Path("docs/schemas")) -> None:
+def schema(
+    folder: Annotated[Path, typer.Argument(metavar="DIR", help="Folder to write to.")] = Path("docs/schemas"), as_json: JsonOption = False
+) -> None:
     """Write the JSON Schemas of the machine file and of the exchange files."""
     from abbe.service.errors import ConfigError
     from abbe.service.schemas import write_schemas
 
     try:
-        for path in write_schemas(folder):
-            typer.echo(str(path))
+        written = [str(path) for path in write_schemas(folder)]
     except OSError as err:
         raise ConfigError(f"{folder}: cannot be written: {err.strerror}", "give a writable folder") from None
+    answer({"files": written}, *written, as_json=as_json)
+    conclude("abbe check-config", as_json=as_json)

@@ -6,11 +6,23 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, open_store, print_json, print_table, warn_of_readers
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    answer,
+    conclude,
+    database_url,
+    open_store,
+    print_json,
+    print_table,
+    warn_of_readers,
+)
 
 if TYPE_CHECKING:
     from abbe.service.storage.store import Store
@@ -26,11 +38,11 @@ RoleArgument = Annotated[str, typer.Argument(metavar="ROLE", help="viewer, opera
 
 
 @user.command("add")
-def add_user(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
+def add_user(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Add a user. The password is asked for, or read from the first line of standard input."""
     with _people(db, machine, must_exist=False) as (people, _):
         people.add(name, role, _password())
-    typer.echo(f"user {name!r} is {role}")
+    _said(name, f"user {name!r} is {role}", (db, machine), as_json=as_json)
 
 
 @user.command("list")
@@ -46,39 +58,41 @@ def list_users(db: DbOption = None, machine: MachineOption = None, as_json: Json
         return
     rows = [(u.name, u.role, u.created_utc[:19], (u.disabled_utc or "")[:19]) for u in found]
     print_table(("name", "role", "since (UTC)", "disabled (UTC)"), rows)
+    then = "abbe user token list" if found else "abbe user add ADMIN admin"
+    conclude(then, machine=machine, db=db, verdict=f"{len(found)} users, {sum(not u.disabled_utc for u in found)} may log in")
 
 
 @user.command("role")
-def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None) -> None:
+def set_role(name: Name, role: RoleArgument, db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Give a user another role. The user's sessions end; tokens keep those of their scopes that the new role allows."""
     with _people(db, machine) as (people, _):
         people.set_role(name, role)
-    typer.echo(f"user {name!r} is {role}")
+    _said(name, f"user {name!r} is {role}", (db, machine), as_json=as_json)
 
 
 @user.command("password")
-def set_password(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+def set_password(name: Name, db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Give a user another password: asked for, or read from standard input. The user's sessions end."""
     with _people(db, machine) as (people, _):
         people.get(name)
         people.set_password(name, _password())
-    typer.echo(f"user {name!r} has a new password")
+    _said(name, f"user {name!r} has a new password", (db, machine), as_json=as_json)
 
 
 @user.command("disable")
-def disable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+def disable_user(name: Name, db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Disable a user at once, with sessions and tokens. Users are not deleted: the audit names them."""
     with _people(db, machine) as (people, _):
         people.disable(name)
-    typer.echo(f"user {name!r} is disabled")
+    _said(name, f"user {name!r} is disabled", (db, machine), as_json=as_json)
 
 
 @user.command("enable")
-def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None) -> None:
+def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None, as_json: JsonOption = False) -> None:
     """Enable a disabled user."""
     with _people(db, machine) as (people, _):
         people.disable(name, enable=True)
-    typer.echo(f"user {name!r} may log in")
+    _said(name, f"user {name!r} may log in", (db, machine), as_json=as_json)
 
 
 @token.command("new")
@@ -89,11 +103,13 @@ def new_token(
     days: Annotated[float, typer.Option("--days", help="How long the token is valid, days.")] = 90.0,
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Create a token and print it, once: only its hash is stored."""
     with _people(db, machine) as (people, _):
         text = people.add_token(name, title, scope, days)
-    typer.echo(text)
+    answer({"user": name, "token": title, "text": text}, text, as_json=as_json)
+    conclude("abbe user token list", machine=machine, db=db, as_json=as_json)
 
 
 @token.command("list")
@@ -109,6 +125,9 @@ def list_tokens(db: DbOption = None, machine: MachineOption = None, as_json: Jso
         return
     rows = [(t.user, t.token, t.prefix, ", ".join(t.scopes), t.expires_utc[:19], (t.revoked_utc or "")[:19]) for t in found]
     print_table(("user", "token", "begins with", "scopes", "until (UTC)", "revoked (UTC)"), rows)
+    valid = [t for t in found if not t.revoked_utc]
+    then = f"abbe user token revoke {quote(valid[0].user)} {quote(valid[0].token)}" if valid else "abbe user list"
+    conclude(then, machine=machine, db=db, verdict=f"{len(found)} tokens, {len(valid)} not revoked")
 
 
 @token.command("revoke")
@@ -117,11 +136,19 @@ def revoke_token(
     title: Annotated[str, typer.Argument(metavar="TOKEN", help="Name of the token.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Revoke a token, at once and permanently."""
     with _people(db, machine) as (people, _):
         people.revoke_token(name, title)
-    typer.echo(f"token {title!r} of {name!r} is revoked")
+    text = f"token {title!r} of {name!r} is revoked"
+    answer({"user": name, "token": title, "text": text}, text, as_json=as_json)
+    conclude("abbe user token list", machine=machine, db=db, as_json=as_json)
+
+
+def _said(name: str, text: str, where: tuple[str | None, Path | None], *, as_json: bool) -> None:
+    answer({"user": name, "text": text}, text, as_json=as_json)
+    conclude("abbe user list", db=where[0], machine=where[1], as_json=as_json)
 
 
 @contextmanager
@@ -157,8 +184,11 @@ def new(
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New file for the private key.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Create a key pair. FILE gets the private key, readable by its owner only; list the printed key under [signatures] trusted."""
     from abbe.service.signed.keys import new_key
 
-    typer.echo(new_key(file))
+    public = new_key(file)
+    answer({"file": str(file), "public_key": public}, public, as_json=as_json)
+    conclude("abbe check-config", machine=machine, as_json=as_json)

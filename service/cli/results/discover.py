@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import json
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, MachineOption, database_url, named_machine, open_store
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, conclude, database_url, named_machine, open_store, print_json
 from abbe.service.cli.measure import AcceptTable
 from abbe.service.cli.results.solve import stored_campaign
 
@@ -26,10 +26,6 @@ if TYPE_CHECKING:
 
 def discover(  # noqa: PLR0913 - one argument for each option
     campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
-    json_file: Annotated[
-        Path | None,
-        typer.Option("--json", metavar="FILE", help="Also write the answer (abbe-discovery/1); - is stdout.", show_default=False),
-    ] = None,
     report: Annotated[
         Path | None,
         typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
@@ -39,13 +35,17 @@ def discover(  # noqa: PLR0913 - one argument for each option
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
     live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine, and continue.")] = False,
     accept_table: AcceptTable = False,
+    as_json: JsonOption = False,
 ) -> None:
     """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
     only if --db or -m names a database. After Ctrl-C the same command resumes.
     """
-    from abbe.service.rendering.document_page import form_of
+    from abbe.service.clock import SystemClock
+    from abbe.service.discovery.discovery_answer import answer_doc
+    from abbe.service.rendering.document_page import form_of, write_document
+    from abbe.service.report.report_discovery import found_report
 
     if report is not None:
         form_of(report)  # refuse a wrong suffix before the work
@@ -56,13 +56,18 @@ def discover(  # noqa: PLR0913 - one argument for each option
         finding = _searched(job, journal)
         if live and store is not None and machine is not None:
             job, journal, finding = _run_live(store, machine, (job, journal, finding), accept_table=accept_table)
-        _written(job, journal, finding, json_file, report)
-    if json_file is not None and str(json_file) == "-":
+        if report is not None:
+            made = SystemClock().utc().isoformat(timespec="seconds")
+            write_document(found_report(job, journal, finding, made), report)
+    if as_json:
+        print_json(answer_doc(finding))
         return
     _print(job, journal, finding)
-    for name, target in (("answer", json_file), ("report", report)):
-        if target is not None:
-            typer.echo(f"{name}: {target}")
+    if report is not None:
+        typer.echo(f"report: {report}")
+    more = finding.next_test is not None and store is not None
+    then = f"abbe discover {quote(campaign)} --live" if more else f"abbe solve {quote(campaign)}"
+    conclude(then, machine=machine, db=None if more else db)
 
 
 @contextmanager
@@ -190,22 +195,6 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
             )
             typer.echo(f"stopped: {kept}", err=True)
             raise
-
-
-def _written(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding, json_file: Path | None, report: Path | None) -> None:
-    """Write the requested files, each whole or not at all."""
-    from abbe.service.clock import SystemClock
-    from abbe.service.discovery.discovery_answer import answer_doc
-    from abbe.service.rendering.document_page import write_document
-    from abbe.service.rendering.page_file import write_page
-    from abbe.service.report.report_discovery import found_report
-
-    if json_file is not None:
-        text = json.dumps(answer_doc(finding), ensure_ascii=False) + "\n"
-        typer.echo(text, nl=False) if str(json_file) == "-" else write_page(text, json_file)
-    if report is not None:
-        made = SystemClock().utc().isoformat(timespec="seconds")
-        write_document(found_report(job, journal, finding, made), report)
 
 
 def _print(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> None:

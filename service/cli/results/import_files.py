@@ -4,11 +4,22 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, MachineOption, database_url, open_store, print_table
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    answer,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from collections.abc import Sequence
@@ -46,36 +57,50 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     feed_mm_min: Annotated[float | None, typer.Option("--feed", help="Between the targets, mm/min.", show_default=False)] = None,
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Import a campaign folder, or files of instruments as one campaign after a preview: all of it or, after any mistake, nothing.
 
     Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
     about their columns; the answers are kept as FILE.columns.toml. What files do not say is asked, or stays unknown and widens U.
-    Temperatures of the options count for files that state none. --machine FILE: the machine with its chain and strokes, and its
+    Temperatures of the options count for files that state none. -m FILE: the machine with its chain and strokes, and its
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
     from abbe.service.instrument_files.answers import Answers
 
     if len(files) == 1 and (files[0].is_dir() or not files[0].suffix):
-        _import_folder(files[0], db, machine)
+        _import_folder(files[0], db, machine, as_json=as_json)
         return
     answers = Answers(
         axis=axis, unit=unit, sign=sign, at_mm=at_mm, scale_c=scale_c, air_c=air_c, pressure_hpa=pressure_hpa, feed_mm_min=feed_mm_min
     )
-    _import_files(files, columns, answers, name or files[0].stem, (db, machine), yes=yes)
+    _import_files(files, columns, answers, name or files[0].stem, (db, machine), yes=yes, as_json=as_json)
 
 
-def _import_folder(folder: Path, db: str | None, machine: Path | None) -> None:
+def _import_folder(folder: Path, db: str | None, machine: Path | None, *, as_json: bool) -> None:
     from abbe.service.runs.exchange import import_folder, read_folder
 
     read_folder(folder)  # before a database is created
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(import_folder(store, folder))
-        typer.echo(f"imported campaign {record.name!r} with {len(store.runs.all(record.id))} runs into {store.url}")
+        _said(record.name, len(store.runs.all(record.id)), store.url, as_json=as_json)
+    conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
 
 
-def _import_files(
-    files: list[Path], columns: Path | None, answers: Answers, name: str, where: tuple[str | None, Path | None], *, yes: bool
+def _said(campaign: str, runs: int, url: str, *, as_json: bool) -> None:
+    doc = {"campaign": campaign, "runs": runs, "database": url}
+    answer(doc, f"imported campaign {campaign!r} with {runs} runs into {url}", as_json=as_json)
+
+
+def _import_files(  # noqa: PLR0913 - what the options say
+    files: list[Path],
+    columns: Path | None,
+    answers: Answers,
+    name: str,
+    where: tuple[str | None, Path | None],
+    *,
+    yes: bool,
+    as_json: bool,
 ) -> None:
     from abbe.service.config import load_machine
     from abbe.service.instrument_files.answers import checked
@@ -85,18 +110,22 @@ def _import_files(
     from abbe.service.site import site_of
 
     db, machine = where
-    site = None if machine is None else site_of(load_machine(machine).machine)
+    file = machine if db is not None else named_machine(machine)
+    site = None if file is None else site_of(load_machine(file).machine)
     contents = [read_file(path, _columns(path, columns)) for path in files]
     answers = _asked(contents, checked(answers))
     made = campaign_of(contents, answers, name, None if site is None else site.doc)
-    _preview(contents, answers, made)
+    if not as_json:
+        _preview(contents, answers, made)
     if not yes and not (sys.stdin.isatty() and typer.confirm("Store this campaign?")):
-        typer.echo("nothing was stored" + ("" if sys.stdin.isatty() else ": --yes stores it"))
+        text = "nothing was stored" + ("" if sys.stdin.isatty() else ": --yes stores it")
+        answer({"campaign": None, "runs": 0, "text": text}, text, as_json=as_json)
+        conclude(f"abbe import {' '.join(quote(str(path)) for path in files)} --yes", machine=machine, db=db, as_json=as_json)
         raise typer.Exit(NOT_STORED)
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(store_folder(store, made.folder))
-        typer.echo(f"imported campaign {record.name!r} with {len(made.folder.runs)} runs into {store.url}")
-        typer.echo(f"`abbe report {record.name}` evaluates it")
+        _said(record.name, len(made.folder.runs), store.url, as_json=as_json)
+    conclude(f"abbe report {quote(record.name)}", machine=machine, db=db, as_json=as_json)
 
 
 def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
@@ -113,7 +142,7 @@ def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
         return None
     found = _columns_asked(path)
     kept.write_text(toml_of(found), encoding="utf-8")
-    typer.echo(f"your answers are in {kept}")
+    typer.echo(f"your answers are in {kept}", err=True)
     return found
 
 

@@ -2,12 +2,25 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    answer,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    print_json,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from abbe.service.domain.model_book import ModelVersion
@@ -44,6 +57,8 @@ def list_models(
         return
     rows = [(m.machine, str(m.version), m.created_utc[:19], ", ".join(e.label for e in m.book.effects), m.book.why) for m in found]
     print_table(("machine", "version", "made (UTC)", "effects", "why"), rows)
+    then = f"abbe model show --of {quote(found[-1].machine)}" if found else "abbe runs"
+    conclude(then, machine=machine, db=db, verdict=f"{len(found)} versions")
 
 
 @model.command("show")
@@ -71,6 +86,8 @@ def show_model(
     source = found.book.provenance
     if source is not None:
         typer.echo(f"{len(source.runs)} runs of campaign {source.campaign}, Abbe {source.versions.get('abbe', '?')}")
+    then = f"abbe model diff {found.version - 1} {found.version}" if found.version > 1 else "abbe model list"
+    conclude(f"{then} --of {quote(found.machine)}", machine=machine, db=db)
 
 
 @model.command("diff")
@@ -96,8 +113,10 @@ def diff_models(
         rows = [{"label": d.label, "what": d.what, "unit": d.unit, "before": _size(d.before), "after": _size(d.after)} for d in found]
         print_json({"machine": name, "first": a.version, "second": b.version, "differences": rows})
         return
+    conclude_with = partial(conclude, f"abbe model show --of {quote(name)}", machine=machine, db=db)
     if not found:
         typer.echo(f"versions {a.version} and {b.version} hold the same effects")
+        conclude_with()
         return
 
     def cell(size: LabelSize | None) -> str:
@@ -105,6 +124,7 @@ def diff_models(
 
     cells = [(d.label, d.what, cell(d.before), cell(d.after), unit(d.unit)) for d in found]
     print_table(("effect", "", f"version {a.version}", f"version {b.version}", "unit"), cells)
+    conclude_with(verdict=f"{len(found)} effects differ")
 
 
 @model.command("revert")
@@ -113,6 +133,7 @@ def revert_model(
     of: OfOption = None,
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Make an older version current again. Nothing is deleted: a new version is appended."""
     from abbe.service.effects.model_book import revert
@@ -120,7 +141,9 @@ def revert_model(
     with open_store(database_url(db, machine)) as store:
         name = _name(store, of, db, machine)
         number = revert(store, name, version)
-    typer.echo(f"machine {name}: version {number} is current; it equals version {version}")
+    text = f"machine {name}: version {number} is current; it equals version {version}"
+    answer({"machine": name, "version": number, "equals": version}, text, as_json=as_json)
+    conclude(f"abbe model show --of {quote(name)}", machine=machine, db=db, as_json=as_json)
 
 
 def _size(size: LabelSize | None) -> dict[str, float] | None:
@@ -173,10 +196,11 @@ def effects(
             print_json([effect_doc(e) for e in found])
             return
         print_table(HEADINGS, [effect_row(e) for e in found])
-        typer.echo("details of an effect: abbe effects NAME")
+        conclude(f"abbe effects {found[0].name}", verdict=f"{len(found)} effects")
         return
     effect = effect_named(name)
     if as_json:
         print_json(effect_doc(effect))
         return
     print_table((effect.name, ""), effect_lines(effect))
+    conclude("abbe runs")

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, MachineOption, database_url, named_machine, open_store, run_or_campaign
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    answer,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    run_or_campaign,
+)
 
 if TYPE_CHECKING:
     from abbe.service.rendering.document import Document
@@ -36,6 +47,7 @@ def report(
     ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
@@ -45,7 +57,7 @@ def report(
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
-    from abbe.service.report.report import rules_of
+    from abbe.service.report.report import NUMBERED, rules_of
     from abbe.service.verification.reduction import AT_20
 
     for target in out or []:
@@ -56,14 +68,20 @@ def report(
     # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
     document = _document(what, number, of, url, rules)
-    for target in out or [Path(default_name(document))]:
+    targets = out or [Path(default_name(document))]
+    for target in targets:
         write_document(document, target)
-        typer.echo(f"report: {target}")
     _, word, text = document.verdict or ("", "", "")
-    typer.echo(f"{document.title}: {word}. {text}".strip())
-    for name, told in document.conditions.items():
-        if name.startswith(AT_20):
-            typer.echo(f"{name}: {told}.")
+    reduced = [f"{name}: {told}." for name, told in document.conditions.items() if name.startswith(AT_20)]
+    doc = {"files": [str(target) for target in targets], "title": document.title, "verdict": word, "text": text}
+    lines = [*(f"report: {target}" for target in targets), f"{document.title}: {word}. {text}".strip(), *reduced]
+    answer(doc, *lines, as_json=as_json)
+    conclude(
+        "abbe trend" if what in NUMBERED else f"abbe solve {quote(what)}",
+        machine=machine,
+        db=None if what in NUMBERED else db,
+        as_json=as_json,
+    )
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:

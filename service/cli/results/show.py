@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,6 +12,8 @@ from abbe.service.cli.common import (
     DbOption,
     JsonOption,
     MachineOption,
+    answer,
+    conclude,
     database_url,
     open_store,
     print_json,
@@ -78,6 +81,9 @@ def runs(
     keys = ("number", "campaign", "machine", "run_id", "test", "role", "status", "reason", "started_utc", "ended_utc")
     heads = ("number", "campaign", "machine", "run", "test", "role", "status", "reason", "started (UTC)", "ended (UTC)")
     print_table(heads, [[str(run[key] or "") for key in keys] for run in found])
+    complete = sum(run["status"] == "complete" for run in found)
+    then = f"abbe show {quote(found[-1]['campaign'] + '/' + found[-1]['run_id'])}" if found else "abbe measure --dry-run"
+    conclude(then, machine=machine, db=db, verdict=f"{len(found)} runs, {complete} complete")
 
 
 def show(
@@ -101,6 +107,7 @@ def show(
         record = run_or_campaign(store, run)
         if not isinstance(record, RunRecord):
             show_campaign(store, record.id, as_json=as_json)
+            conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
             return
         chunks = store.chunks.of_run(record.id)
         facts = json_value(run_summary(record, store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name))
@@ -121,6 +128,7 @@ def show(
     print_table(
         ("column", "rows", "smallest", "largest", "mean"), [_statistics(key, values) for key, values in document["columns"].items()]
     )
+    conclude(f"abbe report {quote(f'{record.campaign}/{record.label}')}", machine=machine, db=db)
 
 
 def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
@@ -155,6 +163,7 @@ def export_campaign(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.", show_default=False)],
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Write a campaign as a folder with campaign.json, one file for each run, and the compensation tables in force, if any."""
     from abbe.service.runs.exchange import export_folder
@@ -163,4 +172,6 @@ def export_campaign(
     with open_store(database_url(db, machine)) as store:
         written = export_folder(store, campaign, folder, images_of(store))
         count = len(store.runs.all(store.campaigns.find(campaign).id))
-    typer.echo(f"exported campaign {campaign!r} with {count} runs to {written}")
+    text = f"exported campaign {campaign!r} with {count} runs to {written}"
+    answer({"campaign": campaign, "runs": count, "folder": str(written)}, text, as_json=as_json)
+    conclude(f"abbe solve {quote(str(written))}", as_json=as_json)

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, machine_file, print_json, print_table
+from abbe.service.cli.common import DbOption, JsonOption, MachineOption, conclude, machine_file, print_json, print_table
 from abbe.service.cli.results.discover import opened
 
 if TYPE_CHECKING:
@@ -59,6 +60,7 @@ def simulate(
     _print_simulation(job, simulation)
     if report is not None:
         typer.echo(f"report: {report}")
+    conclude(f"abbe discover {quote(campaign)}", machine=machine, db=db)
 
 
 def _write_report(job: DiscoveryJob, simulation: Simulation, target: Path) -> None:
@@ -113,6 +115,8 @@ def errors(
         sys.stdout.write("\n")
     else:
         _print_deviations(found)
+        then = f"abbe errors --errors {quote(str(errors_file))} --points {quote(str(points))} --json --out deviations.json"
+        conclude(then, machine=machine)
 
 
 def _print_deviations(found: Deviations) -> None:

@@ -6,30 +6,37 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    print_json,
+    print_table,
+)
+from abbe.service.cli.form import answer_into
+from abbe.service.cli.results.solve_text import print_solution
 
 if TYPE_CHECKING:
     from collections.abc import Callable, Iterator
 
     from abbe.models.arrays import F2
     from abbe.service.campaign_data.campaign_folder import Campaign
-    from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.identification.reanalysis import Executor
-    from abbe.service.identification.solve import Solved
     from abbe.service.identification.solve_report import Assessment
     from abbe.service.storage.store import Store
 
 
 STAGES = 10
 """Stages of the progress display; if the solver needs more, the rest share the last one."""
-
-
-SIDE_BY_SIDE = 3
-"""Largest number of runs side by side in a table: more do not fit in 100 columns."""
 
 
 class ModelName(StrEnum):
@@ -66,16 +73,17 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     ] = None,
     at: Annotated[
         Path | None,
-        typer.Option("--at", metavar="POINTS.csv", help="Also predict the deviation at these points; with --out.", show_default=False),
+        typer.Option("--at", metavar="POINTS.csv", help="Predict the deviation and U at these points, into --out.", show_default=False),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE.csv", help="Deviation and U at the points of --at.", show_default=False),
+        typer.Option("--out", metavar="FILE", help="Where the points of --at, or without them the answer go.", show_default=False),
     ] = None,
     nodes: Annotated[int, typer.Option("--nodes", min=2, max=33, help="Nodes of the grid on each axis.")] = 9,
     unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,
     trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    details: Annotated[bool, typer.Option("--details", help="Also print all parameters, comparisons, noise, and what is missing.")] = False,
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
 
@@ -91,10 +99,10 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 
     if report is not None:
         form_of(report)  # refuse a wrong suffix before the work
-    if (at is None) != (out is None):
+    if at is not None and out is None:
         raise ConfigError("--at and --out belong together", "give both: --at POINTS.csv --out FILE.csv")
-    points = None if at is None else read_points(at).axes_mm
-    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, out)
+    points, target = (None, None) if at is None else (read_points(at).axes_mm, out)
+    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, target)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
@@ -115,13 +123,26 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             doc |= store_solution(store, found, doc)
             if report is not None:
                 _write_report(store, chosen, summary, doc, machine if db is not None else named_machine(machine), report)
-    if as_json:
-        print_json(doc)
-        return
-    _print(summary, SolutionFile.read(doc))
-    for name, target in (("report", report), ("grid", grid), ("deviation", out)):
-        if target is not None:
-            typer.echo(f"{name}: {target}")
+    with answer_into(out if at is None else None):
+        if as_json:
+            print_json(doc)
+            return
+        print_solution(summary, SolutionFile.read(doc), details=details)
+        _name_files({"report": report, "grid": grid, "deviation": target})
+    _conclude(campaign, doc, db, machine)
+
+
+def _name_files(files: dict[str, Path | None]) -> None:
+    for name, file in files.items():
+        if file is not None:
+            typer.echo(f"{name}: {file}")
+
+
+def _conclude(campaign: str, doc: dict[str, Any], db: str | None, machine: Path | None) -> None:
+    if (doc.get("verdict") or {}).get("word") == "mostly assumption":
+        conclude("abbe plan", machine=machine)
+    else:
+        conclude(f"abbe discover {quote(campaign)}", machine=machine, db=db)
 
 
 @dataclass(frozen=True)
@@ -214,119 +235,6 @@ def _write_report(
     write_document(solution_report(store, campaign, SolutionResult(solution, solution.solution_id, summary), made, rules), target)
 
 
-def _print(summary: Assessment, solution: SolutionFile) -> None:
-    from abbe.service.identification.solve_report import noise_lines, outlier_lines, residual_lines, worst_line
-    from abbe.service.identification.table_removal import table_line
-
-    typer.echo(f"campaign {solution.campaign}: model {solution.model}, {len(solution.runs)} runs")
-    _lines("look at these runs:", solution.flags)
-    _parameters(summary)
-    _comparison(summary)
-    o = summary.observability
-    if solution.verdict is not None:
-        typer.echo(f"{solution.verdict.word.capitalize()}. {solution.verdict.text}")
-        typer.echo(solution.verdict.layout)
-    typer.echo(f"The readings determine {o.rank} of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well.")
-    typer.echo(worst_line(summary))
-    _tables(solution)
-    if solution.table_removal is not None:
-        typer.echo(table_line(solution.table_removal))
-    if solution.table_not_removed is not None:
-        typer.echo(f"look at this: {solution.table_not_removed}")
-    if solution.machine_model is not None:
-        _lines(
-            "model book: effects that tables cannot correct (lasting ones are subtracted):",
-            solution.machine_model.not_for_tables,
-        )
-    _lines("noise found:", noise_lines(summary.joint))
-    _lines("outliers:", outlier_lines(summary.solved))
-    _lines("residuals that are not noise:", residual_lines(summary.joint))
-    _lines("these runs cannot tell:", solution.not_observable)
-    _lines("what would show more:", solution.advice)
-    if solution.solution_id is not None:
-        same = ", ".join(map(str, solution.same_as or ()))
-        typer.echo(f"stored: solution {solution.solution_id}" + (f", the same readings and model as solution {same}" if same else ""))
-
-
-def _lines(heading: str, lines: list[str]) -> None:
-    typer.echo(heading if lines else f"{heading} none")
-    for text in lines:
-        typer.echo(f"- {text}")
-
-
-def _parameters(summary: Assessment) -> None:
-    from abbe.models.compensation.additive import SCALE_NOTE
-    from abbe.service.identification.solve_report import HIDDEN_NOTE
-
-    status = {m.name: m.status for m in summary.observability.motions}
-    rows: list[list[str]] = []
-    for p in summary.mean:
-        unit = "µm/m" if p.name[0] == "E" else "µrad"
-        what = f"mean over the volume; {HIDDEN_NOTE}" if status.get(p.name) == "not observable" else "mean over the volume"
-        rows.append([p.name, _figure(p.value * 1e6), f"{2 * p.u * 1e6:.2f}", unit, what])
-    for axis, (v, u) in summary.joint.backlash_mm().items():
-        rows.append([f"backlash {axis}", _figure(v * 1e3), f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
-    print_table(["parameter", "value", "U (k = 2)", "unit", "what"], rows)
-    typer.echo(f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}")
-    by_status = {s: ", ".join(n for n, v in status.items() if v == s) or "none" for s in ("observed", "weak", "not observable")}
-    typer.echo("error motions, each by itself: " + "; ".join(f"{s}: {names}" for s, names in by_status.items()))
-
-
-def _comparison(summary: Assessment) -> None:
-    from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE
-
-    solved = summary.solved
-    labels = list(solved.helices)
-    for at in range(0, len(labels), SIDE_BY_SIDE):
-        some = labels[at : at + SIDE_BY_SIDE]
-        columns = [_helix_row(solved.helices[label].estimate) for label in some]
-        print_table(["ten parameters (± U, k = 2)", *some], [list(row) for row in zip(_helix_names(solved, some), *columns, strict=True)])
-    if labels:
-        typer.echo(HELIX_NOTE)
-    for order, figures in solved.step_totals.items():
-        print_table([f"step diagonals {order}", "value", "U (k = 2)", "unit"], _step_rows(figures))
-    if solved.step_totals:
-        typer.echo(STEP_NOTE)
-
-
-def _helix_names(solved: Solved, labels: list[str]) -> list[str]:
-    return [f"{n} ({_helix_unit(n)[1]})" for n in solved.helices[labels[0]].estimate.names]
-
-
-def _figure(value: float) -> str:
-    return f"{value:.2f}".replace("-0.00", "0.00") if abs(value) < 0.005 else f"{value:.2f}"
-
-
-def _tables(solution: SolutionFile) -> None:
-    if solution.tables:
-        headings = ["error of distances left by this table (± U, k = 2)", "numbers", "rms (µm)", "95 % below (µm)", "largest (µm)"]
-        rows = []
-        for t in solution.tables:
-            figures = ((t.rms_um, t.u_rms_um), (t.q95_um, t.u_q95_um), (t.max_um, t.u_max_um))
-            rows.append([t.kind, str(t.entries), *(f"{value:.2f} ± {2 * u:.2f}" for value, u in figures)])
-        print_table(headings, rows)
-    if solution.monte_carlo is not None:
-        typer.echo(solution.monte_carlo.text)
-
-
-def _helix_unit(name: str) -> tuple[float, str]:
-    return (1e3, "µm") if name.startswith(("offset", "bar", "backlash")) else (1e6, "µm/m" if name[0] == "E" else "µrad")
-
-
-def _helix_row(estimate: Any) -> list[str]:
-    scales = {n: _helix_unit(n)[0] for n in estimate.names}
-    return [f"{estimate.value(n) * f:.1f} ± {2 * estimate.u(n) * f:.1f}" for n, f in scales.items()]
-
-
-def _step_rows(figures: dict[str, float]) -> list[list[str]]:
-    """Return table rows of the step-diagonal figures. Each key ends in its unit; ``u_`` + key holds its standard uncertainty."""
-    rows = []
-    for key in (k for k in figures if not k.startswith("u_")):
-        name, _, unit = key.rpartition("_")
-        rows.append([name.replace("_", " "), f"{figures[key]:.2f}", f"{2 * figures['u_' + key]:.2f}", {"um": "µm", "urad": "µrad"}[unit]])
-    return rows
-
-
 def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="Campaigns by name, e.g. 'june-*'.")] = "*",
     model: Annotated[ModelName, typer.Option("--model", help="As for abbe solve.")] = ModelName.rigid21,
@@ -340,7 +248,6 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     as_json: JsonOption = False,
 ) -> None:
     """Solve many campaigns of a database again, each exactly as abbe solve does; exit code 1 if one was refused."""
-    from abbe.service.cli.common import database_url, open_store
     from abbe.service.errors import NotStored
     from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of
     from abbe.service.identification.reanalysis import solve_all as run
@@ -355,6 +262,9 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
         print_json([answer.doc or {"campaign": answer.campaign, "refused": answer.refused} for answer in answers])
     else:
         print_table(HEADINGS, [row(answer) for answer in answers])
+        refused = [answer.campaign for answer in answers if answer.doc is None]
+        then = f"abbe solve {quote(refused[0])}" if refused else "abbe runs"
+        conclude(then, machine=machine, db=db, verdict=f"{len(answers)} campaigns, {len(refused)} refused")
     raise typer.Exit(1 if any(answer.doc is None for answer in answers) else 0)
 
 

@@ -3,11 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, database_url, named_machine, open_store, print_json, print_table
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    print_json,
+    print_table,
+)
 
 if TYPE_CHECKING:
     from abbe.service.config_schema import MachineFile
@@ -40,6 +51,7 @@ def list_formats(as_json: JsonOption = False) -> None:
         return
     print_table(("format", "what", "holds", "points", "evidence", "sign"), rows)
     print_table(("control", "what"), [(c.key, c.name) for c in CONTROLS.values()])
+    conclude("abbe runs", verdict=f"{len(FORMATS)} formats, {len(CONTROLS)} controls")
 
 
 @comp.command("export")
@@ -97,6 +109,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     for note in made.notes:
         typer.echo(f"- {note}")
     typer.echo(f"wrote {', '.join(written)}")
+    conclude(f"abbe comp import {quote(str(out))} --format {form} --solution {quote(solution)}", machine=machine, db=db)
 
 
 @comp.command("import")
@@ -155,6 +168,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     if "differences_um" in doc:
         sizes = ", ".join(f"{a} {v:.4f} µm" for a, v in doc["differences_um"].items())
         typer.echo(f"these are the tables of solution {solution}; largest difference: {sizes}")
+    conclude("abbe measure --recipe verification", machine=machine)
 
 
 def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -11,6 +12,8 @@ from abbe.service.cli.common import (
     DbOption,
     JsonOption,
     MachineOption,
+    answer,
+    conclude,
     database_url,
     machine_file,
     named_machine,
@@ -57,6 +60,7 @@ def propose(
     with Store.open(loaded.database_url) as store:
         made = run_job(work(store))
         _print_made(store, made, as_json=as_json)
+    conclude(f"abbe comp {'show' if made.proposed.reasons else 'diff'} {made.number}", machine=machine, as_json=as_json)
     raise typer.Exit(1 if made.proposed.reasons else 0)
 
 
@@ -91,7 +95,10 @@ def show_proposals(
 
     with open_store(database_url(db, machine)) as store:
         if proposal is None:
-            _print_list(tables.proposals(reader(store), None, None, MOST)[0], as_json=as_json)
+            found_all = tables.proposals(reader(store), None, None, MOST)[0]
+            _print_list(found_all, as_json=as_json)
+            then = f"abbe comp show {found_all[0].number}" if found_all else "abbe runs"
+            conclude(then, machine=machine, db=db, verdict=f"{len(found_all)} proposals", as_json=as_json)
             return
         found = tables.proposal(reader(store), proposal)
     if as_json:
@@ -106,6 +113,7 @@ def show_proposals(
             typer.echo(f"{word}: {line}")
     for one in found.approvals:
         typer.echo(f"approved by {one.name} (account {one.login}) at {one.utc} until {one.expiry}")
+    conclude(f"abbe comp {'push' if found.approvals else 'diff'} {proposal}", machine=machine, db=None if found.approvals else db)
 
 
 def _print_list(found: list[ProposalSummary], *, as_json: bool) -> None:
@@ -155,6 +163,7 @@ def diff(
     typer.echo(largest(found))
     if html is not None:
         typer.echo(f"wrote {html}")
+    conclude(f"abbe comp approve {proposal}", machine=machine, db=db)
 
 
 def approve(
@@ -165,6 +174,7 @@ def approve(
     ] = 24.0,
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Approve exactly this table, in place of exactly the present one, for this machine and its limits (exit code 1: not approved)."""
     from abbe.service.clock import SystemClock
@@ -177,13 +187,16 @@ def approve(
         try:
             done = work_approve(store, proposal, name.strip() or login(), hours, SystemClock())
         except TableRefused as error:
-            typer.echo(f"not approved: {error}")
+            answer({"proposal": proposal, "approved": False, "text": str(error)}, f"not approved: {error}", as_json=as_json)
+            conclude(f"abbe comp show {proposal}", machine=machine, db=db, as_json=as_json)
             raise typer.Exit(1) from None
         owner = store.proposals.get(proposal).machine
         left_open = open_pushes(store, owner, _control(machine, owner))
-    typer.echo(f"proposal {proposal} is approved by {done.name} until {done.expiry}")
+    text = f"proposal {proposal} is approved by {done.name} until {done.expiry}"
+    answer({"proposal": proposal, "approved": True, "text": text, "warnings": left_open}, text, as_json=as_json)
     for line in left_open:
         typer.echo(f"warning: {line}", err=True)
+    conclude(f"abbe comp push {proposal}", machine=machine, as_json=as_json)
 
 
 def _control(machine: Path | None, name: str) -> str:
@@ -202,20 +215,26 @@ def reject(
     name: Annotated[str, typer.Option("--as", metavar="NAME", help="Who rejects. Default: the account.", show_default=False)] = "",
     db: DbOption = None,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Reject a proposal permanently: it cannot be approved or pushed (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import reject as work_reject
     from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
+    from abbe.service.queries import tables
 
     with open_store(database_url(db, machine)) as store:
         try:
             done = work_reject(store, proposal, name.strip() or login(), reason, SystemClock())
+            campaign = tables.proposal(reader(store), proposal).campaign
         except TableRefused as error:
-            typer.echo(f"not rejected: {error}")
+            answer({"proposal": proposal, "rejected": False, "text": str(error)}, f"not rejected: {error}", as_json=as_json)
+            conclude(f"abbe comp show {proposal}", machine=machine, db=db, as_json=as_json)
             raise typer.Exit(1) from None
-    typer.echo(f"proposal {proposal} is rejected by {done.name}: {done.reason}")
+    text = f"proposal {proposal} is rejected by {done.name}: {done.reason}"
+    answer({"proposal": proposal, "rejected": True, "text": text}, text, as_json=as_json)
+    conclude(f"abbe comp propose {quote(campaign)}", machine=machine, as_json=as_json)
 
 
 def _promise(found: ProposalSummary) -> str:

@@ -7,15 +7,14 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, machine_file, print_json, print_table
-from abbe.service.cli.measure import AcceptTable, ready_session, verification_before
+from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
+from abbe.service.cli.measure import AcceptTable, ready_session, say_correction, verification_before
 from abbe.service.cli.tables.comp_proposals import ProposalArgument
 
 if TYPE_CHECKING:
     from abbe.service.compensation.commission import SignCommissioning
     from abbe.service.compensation.commission_levels import ProvedLevels
     from abbe.service.compensation.correct import Correction
-    from abbe.service.compensation.rollback import RollbackResult
     from abbe.service.storage.store import Store
 
 
@@ -29,6 +28,7 @@ def push(
     ] = 600.0,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Push a proposal, test the signs of its tables, measure again; roll back if the machine is not better (exit code 1)."""
     from abbe.service.cli.running import display, rollback_when_safe, run_job
@@ -57,13 +57,12 @@ def push(
         try:
             found = run_job(work(store))
         except TableRefused as error:  # a negative answer, not a fault
-            for reason in (*error.reasons, *getattr(error, "__notes__", [])):
-                typer.echo(f"not pushed: {reason}")
+            reasons = [*error.reasons, *getattr(error, "__notes__", [])]
+            doc: dict[str, Any] = {"kept": False, "push": None, "text": "; ".join(reasons), "not_for_tables": []}
+            answer(doc, *(f"not pushed: {reason}" for reason in reasons), as_json=as_json)
+            conclude(f"abbe comp show {proposal}", machine=machine, as_json=as_json)
             raise typer.Exit(1) from None
-    typer.echo(("kept: " if found.decision.keep else "rolled back: ") + found.decision.text)
-    for line in (*(f"not in the tables: {text}" for text in found.not_for_tables), *filter(None, hints)):
-        typer.echo(line)
-    raise typer.Exit(0 if found.decision.keep else 1)
+    say_correction(found, hints, machine, as_json=as_json)
 
 
 def rollback(
@@ -73,11 +72,13 @@ def rollback(
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask: I know that the machine is unverified afterwards.")] = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Restore the table that was in force before the last kept push: on a person's order, without measuring. Asks first."""
     from dataclasses import replace
 
     from abbe.service.cli.running import run_job
+    from abbe.service.compensation.rollback import RollbackResult
     from abbe.service.compensation.rollback import rollback as work_rollback
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
@@ -103,12 +104,15 @@ def rollback(
     with Store.open(loaded.database_url) as store:
         found = run_job(work(store))
     if found is None:
-        typer.echo("this table is in force already; nothing was written")
+        lines = ["this table is in force already; nothing was written"]
     elif isinstance(found, str):
-        typer.echo(found)
+        lines = [found]
     else:
-        typer.echo(f"the table is in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}")
-        typer.echo(f"the machine is unverified now: {measure_now(loaded.path)}")
+        lines = [f"the table is in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}"]
+        lines += [f"the machine is unverified now: {measure_now(loaded.path)}"]
+    push_id = found.pushed.push_id if isinstance(found, RollbackResult) else None
+    answer({"push": push_id, "text": "; ".join(lines)}, *lines, as_json=as_json)
+    conclude(measure_now(loaded.path), as_json=as_json)
 
 
 async def _confirmed(to: int | None) -> bool:
@@ -122,6 +126,7 @@ async def _confirmed(to: int | None) -> bool:
 def accept_table(
     yes: Annotated[bool, typer.Option("--yes", help="I have checked the controller: its active table is right.")] = False,
     machine: MachineOption = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, or if this
     database did not push the table. Closes open pushes under any machine name. The push journal records who and when.
@@ -133,6 +138,7 @@ def accept_table(
     from abbe.service.errors import ConfigError
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
+    from abbe.service.verification.verified_by import measure_now
 
     if not yes:
         raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
@@ -144,7 +150,9 @@ def accept_table(
             return await accept(session.controller, store, site, by_whom())
 
     with Store.open(loaded.database_url) as store:
-        typer.echo(asyncio.run(work(store)))
+        text = asyncio.run(work(store))
+    answer({"text": text}, text, as_json=as_json)
+    conclude(measure_now(loaded.path), as_json=as_json)
 
 
 ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no push", 0: "no push: read and export only"}
@@ -195,7 +203,9 @@ def commission(
         print_json({"levels": _levels_doc(levels)} | (_proof_doc(found) if found is not None else {}))
     elif found is not None:
         _show_proof(found)
-    raise typer.Exit(0 if levels.capabilities.level == 3 and (found is None or found.proof.proved) else 1)
+    proved = levels.capabilities.level == 3 and (found is None or found.proof.proved)
+    conclude("abbe runs" if proved and not levels_only else "abbe comp commission", machine=machine, as_json=as_json)
+    raise typer.Exit(0 if proved else 1)
 
 
 def _show_levels(levels: ProvedLevels) -> None:

@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.paths import DIAGONALS
 from abbe.models.solvers.observations import RunData
-from abbe.service.cli.results.solve import _print
+from abbe.service.cli.results.solve_text import print_solution, summary_lines
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import InstrumentsDisagree
@@ -67,7 +67,9 @@ def test_every_step_diagonal_figure_has_its_uncertainty_and_says_what_is_not_in_
 
 def test_words_on_the_screen_say_the_same(solved, capsys):
     told = assess(solved)
-    _print(told, SolutionFile.read({"campaign": "c1"} | solution_doc(told)))
+    solution = SolutionFile.read({"campaign": "c1"} | solution_doc(told))
+    assert 5 <= len(summary_lines(told, solution)) <= 10
+    print_solution(told, solution, details=True)
     text = " ".join(capsys.readouterr().out.split())
     for words in ("on the sphere of their run only", "mirror tilt", "temperature", "step diagonals XYZ", "one tool length"):
         assert words in text

@@ -50,7 +50,8 @@ def finds(monkeypatch: pytest.MonkeyPatch) -> Callable[[Search], Search]:
 def test_a_named_effect_is_told_written_drawn_and_stored(abbe: Call, finds: Callable[[Search], Search], tmp_path: Path) -> None:
     finds(Search())
     folder = write_case(tmp_path / "c1")
-    code, out, _ = abbe("discover", folder, "--db", DB, "--json", "a.json", "--report", "a.html")
+    assert abbe("discover", folder, "--json", "--out", "a.json")[:2] == (0, "")
+    code, out, _ = abbe("discover", folder, "--db", DB, "--report", "a.html")
     assert code == 0
     for words in (
         "backlash (lost motion) X: 8.00 ± 0.20 µm",

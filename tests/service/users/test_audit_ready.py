@@ -135,7 +135,7 @@ def test_a_database_that_cannot_be_opened_refuses_a_command(
 
 def test_a_change_without_a_database_is_said_to_be_unrecorded(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["key", "new", "key.pem"]) == 0
-    assert capsys.readouterr().err == "not recorded in an audit: there is no database abbe.sqlite3\n"
+    assert "not recorded in an audit: there is no database abbe.sqlite3\n" in capsys.readouterr().err
     assert run(["user", "disable", "bob"]) == 2  # refused by itself: one line is enough
     assert capsys.readouterr().err.count("\n") == 1
     assert [p.name for p in folder.iterdir()] == ["key.pem"]
@@ -302,13 +302,13 @@ def test_a_database_that_others_may_read_is_warned_of(folder: Path, capsys: pyte
     Store.open(URL).close()
     for words in (["user", "list"], ["audit", "verify"]):
         assert run(words) == 0
-        assert capsys.readouterr().err == ""
+        assert "warning" not in capsys.readouterr().err
     (folder / "abbe.sqlite3").chmod(0o644)
     for words in (["user", "list"], ["audit", "verify"]):
         assert run(words) == 0
         said = capsys.readouterr().err
         assert said.startswith("warning: abbe.sqlite3 has rights 0644: others than its owner may use it")
-        assert said.count("\n") == 1
+        assert said.splitlines()[1].endswith(("may log in", "next: abbe backup backup"))
 
 
 def test_what_root_makes_belongs_to_the_owner_of_the_folder(open_folder: Path) -> None:
