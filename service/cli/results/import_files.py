@@ -92,7 +92,7 @@ def _said(campaign: str, runs: int, url: str, *, as_json: bool) -> None:
     answer(doc, f"imported campaign {campaign!r} with {runs} runs into {url}", as_json=as_json)
 
 
-def _import_files(  # noqa: PLR0913 - what the options say
+def _import_files(
     files: list[Path],
     columns: Path | None,
     answers: Answers,

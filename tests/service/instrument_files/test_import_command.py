@@ -177,7 +177,7 @@ def test_a_person_is_asked_at_the_terminal(tmp_path: Path) -> None:
     os.close(master)
     os.close(slave)
     assert done.returncode == 0, done.stderr
-    assert "your answers are in t.csv.columns.toml" in done.stdout
+    assert "your answers are in t.csv.columns.toml" in done.stderr
     assert "imported campaign 't' with 1 runs" in done.stdout
     again = subprocess.run(
         [*command, "--yes", "--name", "u"], stdin=subprocess.DEVNULL, capture_output=True, text=True, timeout=60, check=False
