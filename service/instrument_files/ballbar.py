@@ -27,7 +27,12 @@ TEXTS = ("OPERATOR", "DATE_STARTED", "SERIAL_NUMBER", "LAST_CALIBRATED", "PART_N
 NAMED = ("TEST_SPEC", "MACHINE_TESTED")
 ANALYSIS = "RENISHAW_DIAGNOSTICS"
 PLANES = ("XY", "YZ", "ZX")
-_DECLARED = re.compile(rb"\A(?:\xef\xbb\xbf)?<\?xml[^>]*?encoding=[\"']([A-Za-z0-9._-]+)[\"'][^>]*\?>")
+ENCODINGS = frozenset(("utf-8", "us-ascii", "iso-8859-1", "windows-1252", "gbk", "gb2312", "gb18030"))
+"""Encodings that are decoded here; the parser decides about any other."""
+_DECLARED = re.compile(
+    rb"\A(?:\xef\xbb\xbf)?<\?xml\s+version=([\"'])1\.[0-9]\1\s+encoding=([\"'])(?P<encoding>[A-Za-z][A-Za-z0-9._-]*)\2"
+    rb"(?:\s+standalone=([\"'])(?:yes|no)\4)?\s*\?>"
+)
 
 
 @dataclass
@@ -100,7 +105,7 @@ def _figures(file: TextFile, name: str, plane: str, features: list[_Element]) ->
 def _elements(file: TextFile, data: bytes) -> list[_Element]:
     """All elements in the order of their ends, with line, text and the tags around them."""
     out, stack = list[_Element](), list[_Element]()
-    parser = expat.ParserCreate("utf-8")
+    parser = expat.ParserCreate(None, " ")  # with namespaces: an unbound prefix is a mistake
 
     def start(tag: str, attributes: dict[str, str]) -> None:
         stack.append(_Element(tag, attributes, parser.CurrentLineNumber, tuple(one.tag for one in stack)))
@@ -122,20 +127,21 @@ def _elements(file: TextFile, data: bytes) -> list[_Element]:
     try:
         parser.Parse(_utf8(file, data), True)
     except expat.ExpatError as err:
-        what = expat.errors.messages[err.code]
-        raise file.wrong(err.lineno, f"no XML: {what}", "export the file again") from None
+        raise file.wrong(err.lineno, f"no XML: {expat.errors.messages[err.code]}", "export the file again") from None
+    except (LookupError, ValueError) as err:  # of an encoding that Python does not know, or not here
+        raise file.wrong(1, f"no XML: {err}", "export the file again") from None
     return out
 
 
 def _utf8(file: TextFile, data: bytes) -> bytes:
     """The document in UTF-8, without its declaration, which may name an encoding that the parser does not know."""
     found = _DECLARED.match(data)
-    if found is None:
+    encoding = "" if found is None else found["encoding"].decode().lower()
+    if found is None or encoding not in ENCODINGS:
         return data
-    encoding = found.group(1).decode()
     try:
         text = data[found.end() :].decode(encoding)
-    except (LookupError, UnicodeDecodeError):
+    except UnicodeDecodeError:
         raise file.wrong(1, f"it is not in the encoding that it states, {encoding}", "export the file again") from None
     return b"\n" * found.group().count(b"\n") + text.encode()
 

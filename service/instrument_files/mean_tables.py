@@ -12,9 +12,9 @@ from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.answers import LENGTHS
 from abbe.service.instrument_files.content import AxisReadings, Content, axis_of, digest, step_of, text_file
 
-_POS_HEAD = re.compile(r"Position\s+(Bidirectional|Forward Directional|Reverse Directional|Backward Directional) Avg Error")
+_POS_HEAD = re.compile(r"Position\s+(Bidirectional|Forward Directional|Reverse Directional|Backward Directional) Avg Error", re.ASCII)
 _WAYS = {"Bidirectional": 0.0, "Forward Directional": 1.0, "Reverse Directional": -1.0, "Backward Directional": -1.0}
-_REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined")
+_REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined", re.ASCII)
 _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", "compensation end": "end"}
 _UNITS = re.compile(r"(?<![A-Za-z])(millimet(?:re|er)s?|micromet(?:re|er)s?|microns?|mm|um|µm|μm|nm)(?![A-Za-z/])", re.IGNORECASE)
 NEAR = 1e-6

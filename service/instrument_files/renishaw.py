@@ -125,24 +125,19 @@ def _kind(parts: _Sections, head: Mapping[str, str]) -> tuple[str, str, float]:
 
 def _targets(parts: _Sections) -> tuple[F1, bool]:
     """The targets, mm, and whether they were approached from both sides."""
-    file, count, both = parts.file, None, None
-    values: list[float] | None = None
+    file, at, lines, values = parts.file, parts.at["TARGET DATA"], dict[str, tuple[int, str]](), list[float]()
     for line, text in parts.lines["TARGET DATA"]:
         key, colon, rest = text.partition(":")
         name = " ".join(key.split()).lower()
-        if not colon and values is not None and both is None:
-            values += [file.number(line, word, "a target") for word in text.split()]
-        elif name == "target-count" and count is None:
-            count = _whole(file, line, rest.strip(), "Target-count")
-        elif name == "targets" and values is None:
-            values = [file.number(line, word, "a target") for word in rest.split()]
-        elif name == "flags" and both is None:
-            both = _both(file, line, rest)
-        elif name != "filetype":
+        known = name in ("target-count", "targets", "flags") and name not in lines if colon else "targets" in lines and "flags" not in lines
+        if not known and not (colon and name == "filetype"):
             raise file.wrong(line, f"{text[:40]!r} is not known, or a second time, in TARGET DATA::")
-    at = parts.at["TARGET DATA"]
-    if count is None or values is None or both is None:
+        lines |= {name: (line, rest.strip())} if colon else {}
+        if not colon or name == "targets":
+            values += [file.number(line, word, "a target") for word in (rest if colon else text).split()]
+    if not {"target-count", "targets", "flags"} <= set(lines):
         raise file.wrong(at, "TARGET DATA:: needs Target-count, Targets and Flags")
+    count, both = _whole(file, *lines["target-count"], "Target-count"), _both(file, *lines["flags"])
     if len(values) != count:
         raise file.wrong(at, f"{len(values)} targets, Target-count says {count}")
     step = np.diff(values)
