@@ -9,6 +9,7 @@ as `bar_is_valid`, interpret its bits.
 
 from __future__ import annotations
 
+import math
 from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
@@ -72,6 +73,7 @@ class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
     ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument translates its own. ``refractivity``: n - 1 of air.
+    What an instrument does not measure of the air is NaN (`air_doc`).
     """
 
     host_s: float
@@ -261,6 +263,16 @@ class Controller(Identity, Paths, Tables, Protocol):
     """All capabilities of a controller. Functions should require only the part that they need."""
 
 
+def only_listens(controller: Identity | Motion) -> bool:
+    """Whether a control can only be listened to: it takes no motion commands and shows no compensation tables."""
+    return bool(getattr(controller, "only_listens", False))
+
+
+def resolution_mm(meter: DisplacementMeter) -> float:
+    """Smallest step of a meter's readings, mm: that of its device file, else that of docs/protocols/laser.md."""
+    return float(getattr(meter, "resolution_mm", 1e-7))
+
+
 class Fixture(Protocol):
     """Mounts bars and mirrors: the operator at the console, or a remote fixture (docs/protocols/fixture.md)."""
 
@@ -303,6 +315,12 @@ _BEAM_GONE = int(LaserFlag.BEAM_LOST | LaserFlag.NO_REFLECTOR)
 _BEAM_BAD = _BEAM_GONE | int(LaserFlag.SIGNAL_LOW)
 _COMPENSATED = int(LaserFlag.COMPENSATED)
 _NO_SIGNAL = int(LaserFlag.SIGNAL_LOW | LaserFlag.NO_REFLECTOR)
+
+
+def air_doc(reading: LaserReading) -> dict[str, float]:
+    """Return air temperature and pressure of a reading as fields of its record, without those that the instrument does not measure."""
+    known = {"air_temp_c": reading.air_temp_c, "air_pressure_pa": reading.air_pressure_pa}
+    return {name: value for name, value in known.items() if not math.isnan(value)}
 
 
 def on_path(status: int) -> bool:

@@ -109,6 +109,18 @@ class LossyLine(DriverError):
     code = "DRV-011"
 
 
+class BadDeviceFile(DriverError):
+    """A device file is missing, unreadable, or contradicts itself."""
+
+    code = "DRV-012"
+
+
+class NotProved(DriverError):
+    """What a job needs is proved neither by the device file nor by the report of its test."""
+
+    code = "DRV-013"
+
+
 T = TypeVar("T")
 
 

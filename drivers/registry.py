@@ -1,25 +1,40 @@
 """Open devices by URL: each function returns a connected driver that has verified the kind of its device.
 
-A package adds another protocol with an entry point named like its URL scheme::
+A device with another protocol is described by a file (`abbe.drivers.described`), or a package adds a driver with an entry point named like
+its URL scheme (docs/how-to/own-device.md)::
 
-    [project.entry-points."abbe.cnc"]
-    "acme+tcp" = "acme_driver:open_controller"      # async def open_controller(url: str) -> abbe.drivers.api.Controller
+    [project.entry-points."abbe.drivers"]
+    "acme+tcp" = "acme_driver:DRIVER"      # DRIVER = {"cnc": open_controller}; async def open_controller(url: str) -> Controller
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from typing import cast
 
 from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.described.control import ListenedControl
+from abbe.drivers.described.opening import open_control, open_meter
+from abbe.drivers.described.tested import Ability
 from abbe.drivers.errors import BadUrl
 from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_link import Canary, ModbusLink
 from abbe.drivers.links.serial_link import ByteLink
-from abbe.drivers.links.urls import FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, installed, parse_url
+from abbe.drivers.links.urls import (
+    FixtureConsoleUrl,
+    FixtureTcpUrl,
+    ModbusRtuUrl,
+    ModbusTcpUrl,
+    SerialUrl,
+    SocketUrl,
+    described_by,
+    installed,
+    parse_url,
+)
 
 HEARTBEAT_S = 1.0
 """Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
@@ -35,8 +50,8 @@ async def open_ballbar(url: str) -> BallBar:
     LinkDown, ReplyTimeout
         No connection, or no answer.
     """
-    if (entry := installed("ballbar", url)) is not None:
-        return cast(BallBar, await _opened(entry, url))
+    if (entry := installed(url)) is not None:
+        return cast(BallBar, await _opened(entry, "ballbar", url))
     parsed = parse_url(url)
     if not isinstance(parsed, SerialUrl | SocketUrl):
         raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
@@ -46,7 +61,7 @@ async def open_ballbar(url: str) -> BallBar:
 
 
 async def open_laser(url: str) -> DisplacementMeter:
-    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or behind a URL of an installed driver.
+    """Open the laser behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, behind a URL of an installed driver, or by a device file.
 
     Raises
     ------
@@ -54,18 +69,22 @@ async def open_laser(url: str) -> DisplacementMeter:
         Not such a URL.
     WrongDevice
         Something else answers there.
+    BadDeviceFile, NotProved
+        The device file cannot be used, or the report of the device's test does not prove what a measurement needs.
     LinkDown, ReplyTimeout, BadFrame
         Communication failed.
     """
-    if (entry := installed("laser", url)) is not None:
-        return cast(DisplacementMeter, await _opened(entry, url))
+    if (entry := installed(url)) is not None:
+        return cast(DisplacementMeter, await _opened(entry, "laser", url))
+    if described_by(parsed := parse_url(url)):
+        return await open_meter(parsed, needed=Ability.DWELL)
     laser = ModbusLaser(await _modbus(url, "a laser"))
     await _identify_or_close(laser)
     return laser
 
 
 async def open_controller(url: str) -> Controller:
-    """Open the controller behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, or behind a URL of an installed driver.
+    """Open the controller behind a ``modbus+tcp://`` or ``modbus+rtu://`` URL, behind a URL of an installed driver, or by a device file.
 
     Raises
     ------
@@ -73,15 +92,24 @@ async def open_controller(url: str) -> Controller:
         Not such a URL.
     WrongDevice
         Something else answers there.
+    BadDeviceFile, NotProved
+        As for `open_laser`.
     LinkDown, ReplyTimeout, BadFrame
         Communication failed.
     """
-    if (entry := installed("cnc", url)) is not None:
-        controller = cast(Controller, await _opened(entry, url))
+    if (entry := installed(url)) is not None:
+        controller = cast(Controller, await _opened(entry, "cnc", url))
+    elif described_by(parsed := parse_url(url)):
+        return await open_control(parsed, needed=Ability.DWELL)
     else:
         controller = ModbusController(await _modbus(url, "a controller"))
     await _identify_or_close(controller)
     return controller
+
+
+def no_controller() -> Controller:
+    """Return the stand-in for a control that is not connected: an operator runs the NC program, and nothing is known of its position."""
+    return ListenedControl(None, None)
 
 
 async def open_fixture(url: str, ask: Ask) -> Fixture:
@@ -106,14 +134,27 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
     return fixture
 
 
-async def _opened(entry: EntryPoint, url: str) -> object:
-    """Open a device with the driver of an installed package."""
+ROLES: dict[str, type] = {"laser": DisplacementMeter, "ballbar": BallBar, "cnc": Controller}
+"""What a driver opens for each role."""
+
+
+async def _opened(entry: EntryPoint, role: str, url: str) -> object:
+    """Open a device with the driver of an installed package, and refuse one that lacks a method of its role."""
+    remedy = "repair or remove the package that offers it"
     try:
-        opener = entry.load()
+        driver = entry.load()
     except Exception as fault:  # an import of foreign code may raise anything
         detail = f"the driver {entry.value} cannot be loaded: {type(fault).__name__}: {fault}"
-        raise BadUrl(ascii(url), "open device", detail, "repair or remove the package that offers it") from fault
-    return await opener(url)
+        raise BadUrl(ascii(url), "open device", detail, remedy) from fault
+    if not isinstance(driver, Mapping) or not callable(driver.get(role)):
+        raise BadUrl(ascii(url), "open device", f"the driver {entry.value} opens no {role}", "is this the right device for this key?")
+    device = await driver[role](url)
+    missing = sorted(name for name in dir(ROLES[role]) if name[0] != "_" and not hasattr(device, name))
+    if missing:
+        if hasattr(device, "close"):
+            await device.close()
+        raise BadUrl(ascii(url), "open device", f"the driver {entry.value} lacks {', '.join(missing)}", remedy)
+    return cast(object, device)
 
 
 async def _modbus(url: str, what: str) -> ModbusLink:

@@ -17,6 +17,7 @@ from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
 from pydantic_settings.exceptions import SettingsError
 
+from abbe.drivers.links.urls import beside
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
 from abbe.service.errors import ConfigError, expected, location_text, nearest
 from abbe.service.secrets import mask_secrets
@@ -71,9 +72,16 @@ def load_machine(path: Path | str) -> LoadedMachine:
     except ValidationError as err:
         raise _config_error(path, err.errors(), from_environment) from None
     _check_exclusive(path, merged)
+    machine = _with_files(machine, path.resolve().parent)
     origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
     origins |= dict.fromkeys((key for key, _ in _leaves(from_environment)), "environment")
     return LoadedMachine(path, machine, origins)
+
+
+def _with_files(machine: MachineFile, folder: Path) -> MachineFile:
+    """Return the machine file with the files of its device URLs named from any working directory."""
+    urls = {role: beside(url, folder) for role, url in machine.devices.model_dump().items() if url is not None}
+    return machine.model_copy(update={"devices": machine.devices.model_copy(update=urls)})
 
 
 def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:

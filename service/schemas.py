@@ -7,6 +7,7 @@ from pathlib import Path
 
 from pydantic import BaseModel
 
+from abbe.drivers.device_file import DeviceFile
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.domain.machine import MachineObject
@@ -15,6 +16,7 @@ from abbe.service.domain.solution_file import SolutionFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,
+    "device-file": DeviceFile,
     "machine": MachineObject,
     "run": RunFile,
     "campaign": CampaignFile,

@@ -87,7 +87,9 @@ def _pdu_mismatch(asked: bytes, heard: bytes) -> str:
 # All failures become typed errors here: the library's own log would only repeat them on stderr.
 logging.getLogger("pymodbus").addHandler(logging.NullHandler())
 
-READ_HOLDING, READ_INPUT, WRITE = 3, 4, 16
+READ_HOLDING, READ_INPUT, WRITE, WRITE_ONE = 3, 4, 16, 6
+WRITES = (WRITE, WRITE_ONE)
+_PARITY = {"none": "N", "even": "E", "odd": "O"}
 # With these options the kernel, too, detects within 3 s that a peer has vanished.
 _KEEPALIVE = (("TCP_KEEPIDLE", 1), ("TCP_KEEPINTVL", 1), ("TCP_KEEPCNT", 2), ("TCP_USER_TIMEOUT", 2500))
 _BITS_PER_BYTE = 11
@@ -105,7 +107,7 @@ class Request:
     values: tuple[int, ...] = ()
 
     def __str__(self) -> str:
-        return f"{'write' if self.function == WRITE else 'read'} registers {self.address}..{self.address + self.count - 1}"
+        return f"{'write' if self.function in WRITES else 'read'} registers {self.address}..{self.address + self.count - 1}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,6 +188,8 @@ class ModbusWire:
                 match request.function:
                     case 16:
                         reply = await client.write_registers(request.address, list(request.values), device_id=unit)
+                    case 6:
+                        reply = await client.write_register(request.address, request.values[0], device_id=unit)
                     case 4:
                         reply = await client.read_input_registers(request.address, count=request.count, device_id=unit)
                     case _:
@@ -267,6 +271,7 @@ class ModbusWire:
             url.path,
             framer=FramerType.RTU,
             baudrate=url.baud,
+            parity=_PARITY[url.parity],
             timeout=slack_s,
             retries=0,
             reconnect_delay=0,

@@ -14,7 +14,7 @@ from enum import Enum
 
 from abbe.drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, Refused, ReplyTimeout
 from abbe.drivers.links.incidents import Backoff, Incidents
-from abbe.drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, ModbusReply, ModbusWire, Request
+from abbe.drivers.links.modbus import READ_HOLDING, READ_INPUT, WRITE, WRITES, ModbusReply, ModbusWire, Request
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.drivers.links.words import CANARY_WORDS, RegisterBlock
 
@@ -109,12 +109,13 @@ class Canary:
     """Registers with known content, which verify that replies come from this device and match their requests.
 
     ``words``: content from ``address`` on; ``readable``: most registers that one request may read from there. The number read varies,
-    because replies of different length cannot be confused.
+    because replies of different length cannot be confused. ``functions``: function codes that read these registers and all others alike.
     """
 
     address: int = 0
     words: tuple[int, ...] = CANARY_WORDS
     readable: int = 12
+    functions: tuple[int, ...] = (READ_HOLDING, READ_INPUT)
 
 
 class ModbusLine:
@@ -164,10 +165,12 @@ class ModbusLine:
 
         With a canary, reads alternate between functions 3 and 4 and have 0 to ``lead`` extra registers, so that a late reply is recognised.
         """
-        if self._canary is None or request.function == WRITE:
+        if self._canary is None or request.function in WRITES:
             return request, 0
         skip = self._turn // 2 % (lead + 1)
-        return Request(self._function(), request.address - skip, request.count + skip), skip
+        if len(self._canary.functions) == 1:
+            return Request(request.function, request.address - skip, request.count + skip), skip
+        return Request(self._function(self._canary), request.address - skip, request.count + skip), skip
 
     async def ask(self, request: Request) -> ModbusReply:
         """Send a request once; on RTU accept its reply only if the canary read after it is right. Raises the errors of the wire."""
@@ -224,15 +227,15 @@ class ModbusLine:
         """Read the canary by a request that differs each time in function or length; empty without a valid reply."""
         longer = (self._turn // 2 + proof) % (canary.readable - len(canary.words) + 1)
         try:
-            answer = await self._asked(Request(self._function(), canary.address, len(canary.words) + longer))
+            answer = await self._asked(Request(self._function(canary), canary.address, len(canary.words) + longer))
         except (ReplyTimeout, BadFrame):
             return ()
         await self._wire.gap()
         return answer.registers[: len(canary.words)]
 
-    def _function(self) -> int:
+    def _function(self, canary: Canary) -> int:
         self._turn += 1
-        return READ_INPUT if self._turn % 2 else READ_HOLDING
+        return canary.functions[self._turn % len(canary.functions)]
 
 
 MAX_READ = 125
@@ -321,8 +324,10 @@ class ModbusLink:
         """Number of unsolicited bytes: noise, late replies, or a second master."""
         return self._line.foreign_bytes
 
-    async def read(self, address: int, count: int, *, lead: int = 0) -> tuple[int, ...]:
+    async def read(self, address: int, count: int, *, lead: int = 0, function: int = READ_HOLDING) -> tuple[int, ...]:
         """Read ``count`` (1..125) registers with one request, with one retry over a new or verified line.
+
+        ``function``: 3 or 4; a link whose canary has both uses them in turn.
 
         ``lead``: registers before ``address`` that may be read, too. On RTU, the link reads a varying number of them and alternates
         functions 3 and 4, so that it recognises a reply to an earlier read.
@@ -336,14 +341,16 @@ class ModbusLink:
         """
         if not 1 <= count <= MAX_READ:
             raise ValueError(f"a Modbus read takes 1..{MAX_READ} registers, not {count}")
-        return await self._transact(Request(READ_HOLDING, address, count), ModbusOperation.READ, min(lead, MAX_READ - count))
+        return await self._transact(Request(function, address, count), ModbusOperation.READ, min(lead, MAX_READ - count))
 
     async def read_block(self, block: RegisterBlock) -> tuple[int, ...]:
         """Read the registers of a block of a register map, in one request; errors as for ``read``."""
         return await self.read(block.base, block.count, lead=block.lead)
 
-    async def write(self, address: int, values: Sequence[int], op: ModbusOperation = ModbusOperation.TRIGGER) -> None:
-        """Write 1..123 registers (FC16); ``op`` determines whether the write may be repeated.
+    async def write(
+        self, address: int, values: Sequence[int], op: ModbusOperation = ModbusOperation.TRIGGER, *, function: int = WRITE
+    ) -> None:
+        """Write 1..123 registers (FC16, or one with FC6); ``op`` determines whether the write may be repeated.
 
         Raises
         ------
@@ -354,7 +361,7 @@ class ModbusLink:
         """
         if not 1 <= len(values) <= MAX_WRITE:
             raise ValueError(f"a Modbus write takes 1..{MAX_WRITE} registers, not {len(values)}")
-        await self._transact(Request(WRITE, address, len(values), tuple(values)), op)
+        await self._transact(Request(function, address, len(values), tuple(values)), op)
 
     async def close(self) -> None:
         """Close the link; a pending request ends with ``LinkDown``. Closing twice does nothing."""
@@ -466,4 +473,6 @@ class ModbusLink:
             self._asked_at = clock()
             if self._wire.up or not self._backoff.left_s():
                 with contextlib.suppress(DriverError):  # already noted as an incident; the next request raises it, too
-                    await self._transact(Request(READ_HOLDING, canary.address, len(canary.words)), ModbusOperation.READ, patience_s=0.0)
+                    await self._transact(
+                        Request(canary.functions[0], canary.address, len(canary.words)), ModbusOperation.READ, patience_s=0.0
+                    )

@@ -111,11 +111,15 @@ class ByteLink:
     """A byte pipe to one device, which may return at another port.
 
     A serial port is locked: no second program (or link) can open it. An adapter with a serial number is found again at any port, and no
-    other adapter is accepted instead; ``adapters`` returns the adapters now plugged in.
+    other adapter is accepted instead; ``adapters`` returns the adapters now plugged in. ``bits``, ``stop``: data and stop bits of a
+    character.
     """
 
-    def __init__(self, url: SerialUrl | SocketUrl, adapters: Callable[[], list[Adapter]] | None = None) -> None:
+    def __init__(
+        self, url: SerialUrl | SocketUrl, adapters: Callable[[], list[Adapter]] | None = None, *, bits: int = 8, stop: int = 1
+    ) -> None:
         self._url = url
+        self._bits, self._stop = bits, stop
         self._adapters = adapters or plugged_in
         self._adapter: Adapter | None = None
         self.name = str(url)
@@ -271,7 +275,16 @@ class ByteLink:
         listed = self._adapters()
         path = path_to_open(self.name, url.path, self._adapter, listed)
         try:
-            port = serial.serial_for_url(path, baudrate=url.baud, parity=_PARITY[url.parity], timeout=0, write_timeout=0, exclusive=True)
+            port = serial.serial_for_url(
+                path,
+                baudrate=url.baud,
+                parity=_PARITY[url.parity],
+                timeout=0,
+                write_timeout=0,
+                exclusive=True,
+                bytesize=self._bits,
+                stopbits=self._stop,
+            )
         except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError, termios.error is not
             raise LinkDown(self.name, "open", str(error), serial_remedy(path, error)) from error
         self._adapter = adapter_at(path, listed) or self._adapter

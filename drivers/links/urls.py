@@ -6,6 +6,8 @@
 ``socket://10.0.0.5:4001``                              the same bytes over raw TCP (serial device server); serial_no as above
 ``modbus+tcp://10.0.0.6:502?unit=1``                    Modbus TCP
 ``modbus+rtu:///dev/ttyS0?baud=115200&unit=1``          Modbus RTU, 8N1
+``socket://10.0.0.8:23?device=FILE.toml``               a device described by a file (`abbe.drivers.described`); also with
+                                                        ``tested=FILE.json``, the report of ``abbe device test``
 ``fixture+tcp://10.0.0.7:9000``                         a remote fixture (docs/protocols/fixture.md)
 ``fixture+console:``                                    the operator at the console
 ======================================================  =======================================================
@@ -16,8 +18,9 @@ Installed packages add devices with other protocols and other schemes: `installe
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from urllib.parse import SplitResult, parse_qsl, quote, unquote, urlsplit
 
 from abbe.drivers.errors import BadUrl
@@ -31,21 +34,39 @@ PARITIES = ("none", "even", "odd")
 
 
 @dataclass(frozen=True, slots=True)
+class Description:
+    """Files about a device whose protocol is not built in, as in the URL: its device file, and the report of ``abbe device test``."""
+
+    device: str = ""
+    tested: str = ""
+
+    def __bool__(self) -> bool:
+        return bool(self.device)
+
+    def __str__(self) -> str:
+        return "".join(f"&{key}={quote(value)}" for key, value in (("device", self.device), ("tested", self.tested)) if value)
+
+
+NOT_DESCRIBED = Description()
+
+
+@dataclass(frozen=True, slots=True)
 class SerialUrl:
     """A serial port, by its device path: 8 data bits, 1 stop bit; ``baud`` in bit/s; ``parity``: none, even or odd.
 
-    ``serial_no``: serial number of the only accepted device; None: any.
+    ``serial_no``: serial number of the only accepted device; None: any. ``description``: `Description`.
     """
 
     path: str
     baud: int = SERIAL_BAUD
     parity: str = "none"
     serial_no: int | None = None
+    description: Description = NOT_DESCRIBED
 
     def __str__(self) -> str:
         parity = "" if self.parity == "none" else f"&parity={self.parity}"
         number = "" if self.serial_no is None else f"&serial_no={self.serial_no}"
-        return f"serial://{quote(self.path)}?baud={self.baud}{parity}{number}"
+        return f"serial://{quote(self.path)}?baud={self.baud}{parity}{number}{self.description}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,10 +76,11 @@ class SocketUrl:
     host: str
     port: int
     serial_no: int | None = None
+    description: Description = NOT_DESCRIBED
 
     def __str__(self) -> str:
-        number = "" if self.serial_no is None else f"?serial_no={self.serial_no}"
-        return f"socket://{_netloc(self.host, self.port)}{number}"
+        query = f"{'' if self.serial_no is None else f'&serial_no={self.serial_no}'}{self.description}"
+        return f"socket://{_netloc(self.host, self.port)}{query.replace('&', '?', 1)}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,21 +90,25 @@ class ModbusTcpUrl:
     host: str
     port: int
     unit: int = 1
+    description: Description = NOT_DESCRIBED
 
     def __str__(self) -> str:
-        return f"modbus+tcp://{_netloc(self.host, self.port)}?unit={self.unit}"
+        return f"modbus+tcp://{_netloc(self.host, self.port)}?unit={self.unit}{self.description}"
 
 
 @dataclass(frozen=True, slots=True)
 class ModbusRtuUrl:
-    """A Modbus RTU line (``baud`` in bit/s, 8N1) and the unit on it."""
+    """A Modbus RTU line (``baud`` in bit/s, 8 data bits, 1 stop bit) and the unit on it."""
 
     path: str
     baud: int = RTU_BAUD
     unit: int = 1
+    parity: str = "none"
+    description: Description = NOT_DESCRIBED
 
     def __str__(self) -> str:
-        return f"modbus+rtu://{quote(self.path)}?baud={self.baud}&unit={self.unit}"
+        parity = "" if self.parity == "none" else f"&parity={self.parity}"
+        return f"modbus+rtu://{quote(self.path)}?baud={self.baud}&unit={self.unit}{parity}{self.description}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,37 +173,75 @@ _ROLES: Mapping[str, tuple[type[DeviceUrl], ...]] = {
 }
 
 
+_DESCRIBED_ROLES = ("laser", "cnc")
+
+
 def is_url_of(role: str, text: str) -> bool:
     """Whether a URL leads to a device of this role: ballbar, laser, cnc or fixture. Raises the errors of `parse_url`.
 
-    An installed driver checks URLs of its own scheme when it opens the device.
+    An installed driver, or a device file, is checked when the device is opened.
     """
-    return installed(role, text) is not None or isinstance(parse_url(text), _ROLES[role])
+    if installed(text) is not None:
+        return role != "fixture"
+    url = parse_url(text)
+    return role in _DESCRIBED_ROLES if described_by(url) else isinstance(url, _ROLES[role])
 
 
-def installed(role: str, text: str) -> EntryPoint | None:
+def described_by(url: DeviceUrl) -> Description:
+    """Return the files in a URL that describe its device; false without a device file."""
+    return NOT_DESCRIBED if isinstance(url, FixtureTcpUrl | FixtureConsoleUrl) else url.description
+
+
+def beside(text: str, folder: Path) -> str:
+    """Return a URL whose files (`Description`) are found from any working directory; relative ones lie in ``folder``."""
+    if installed(text) is not None:
+        return text
+    url = parse_url(text)
+    found = described_by(url)
+    if not found or isinstance(url, FixtureTcpUrl | FixtureConsoleUrl):
+        return text
+    shipped = "." not in found.device and "/" not in found.device
+    files = Description(found.device if shipped else str(folder / found.device), str(folder / found.tested) if found.tested else "")
+    return str(replace(url, description=files))
+
+
+def installed(text: str) -> EntryPoint | None:
     """Return the driver of an installed package for a URL; None without one, or for a built-in scheme.
 
-    A driver is an entry point of the group ``abbe.cnc``, ``abbe.laser`` or ``abbe.ballbar`` with the scheme as its name. Its object is a
-    coroutine function that opens and identifies the device behind such a URL (`abbe.drivers.api`). Nothing is loaded here.
+    A driver is an entry point of the group ``abbe.drivers`` with the scheme as its name (`abbe.drivers.registry`). Nothing is loaded here.
     """
     scheme = text.partition(":")[0].lower()
     if scheme in _BUILDERS:
         return None
-    return next(iter(entry_points(group=f"abbe.{role}", name=scheme)), None)
+    return next(iter(entry_points(group="abbe.drivers", name=scheme)), None)
 
 
 def _serial(text: str, parts: SplitResult) -> SerialUrl:
-    query = _query(text, parts, {"baud", "parity", "serial_no"})
-    parity = query.get("parity", "none")
-    if parity not in PARITIES:
-        raise _bad(text, f"parity={parity!a} is none of {', '.join(PARITIES)}")
-    return SerialUrl(_path(text, parts), _number(text, query, "baud", SERIAL_BAUD, _MAX_BAUD), parity, _serial_no(text, query))
+    query = _query(text, parts, {"baud", "parity", "serial_no", *_FILES})
+    baud = _number(text, query, "baud", SERIAL_BAUD, _MAX_BAUD)
+    return SerialUrl(_path(text, parts), baud, _parity(text, query), _serial_no(text, query), _description(text, query))
 
 
 def _socket(text: str, parts: SplitResult) -> SocketUrl:
-    query = _query(text, parts, {"serial_no"})
-    return SocketUrl(*_address(text, parts), _serial_no(text, query))
+    query = _query(text, parts, {"serial_no", *_FILES})
+    return SocketUrl(*_address(text, parts), _serial_no(text, query), _description(text, query))
+
+
+_FILES = ("device", "tested")
+
+
+def _description(text: str, query: Mapping[str, str]) -> Description:
+    found = Description(*(query.get(key, "") for key in _FILES))
+    if found.tested and not found.device:
+        raise _bad(text, "tested= needs device=", "name the device file that was tested, too")
+    return found
+
+
+def _parity(text: str, query: Mapping[str, str]) -> str:
+    parity = query.get("parity", "none")
+    if parity not in PARITIES:
+        raise _bad(text, f"parity={parity!a} is none of {', '.join(PARITIES)}")
+    return parity
 
 
 def _serial_no(text: str, query: Mapping[str, str]) -> int | None:
@@ -185,15 +249,16 @@ def _serial_no(text: str, query: Mapping[str, str]) -> int | None:
 
 
 def _modbus_tcp(text: str, parts: SplitResult) -> ModbusTcpUrl:
-    query = _query(text, parts, {"unit"})
+    query = _query(text, parts, {"unit", *_FILES})
     host, port = _address(text, parts)
-    return ModbusTcpUrl(host, port, _number(text, query, "unit", 1, _MAX_UNIT))
+    return ModbusTcpUrl(host, port, _number(text, query, "unit", 1, _MAX_UNIT), _description(text, query))
 
 
 def _modbus_rtu(text: str, parts: SplitResult) -> ModbusRtuUrl:
-    query = _query(text, parts, {"baud", "unit"})
+    query = _query(text, parts, {"baud", "unit", "parity", *_FILES})
     baud = _number(text, query, "baud", RTU_BAUD, _MAX_BAUD)
-    return ModbusRtuUrl(_path(text, parts), baud, _number(text, query, "unit", 1, _MAX_UNIT))
+    unit = _number(text, query, "unit", 1, _MAX_UNIT)
+    return ModbusRtuUrl(_path(text, parts), baud, unit, _parity(text, query), _description(text, query))
 
 
 def _fixture_tcp(text: str, parts: SplitResult) -> FixtureTcpUrl:

@@ -1,7 +1,8 @@
 """Listens to a program that the operator starts: reads the laser continuously and turns its standstills into the readings of the recipe.
 
 This is for controllers that Abbe does not move. Abbe writes nothing to the controller and uses only its clock, its position and the status
-"NC program running". Sample times are those of the laser's own clock, converted to the controller's.
+"NC program running"; it also works without any connection to one. Sample times are those of the laser's own clock, converted to the
+controller's.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import ControllerStatus, LaserReading, Point, air_is_compensated
+from abbe.drivers.api import ControllerStatus, LaserReading, Point, air_doc, air_is_compensated
 from abbe.drivers.errors import DriverError, run_to_end
 from abbe.models.alignment.clock import ClockFit, fit_clock
 from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, detect, merged, named
@@ -120,8 +121,10 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
 
 
 async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: Report) -> None:
-    """Wait until the machine stands at the start of the test, where a person mounts the mirror."""
+    """Wait until the machine stands at the start of the test, where a person mounts the mirror and so confirms it without a control."""
     before, reported = None, False
+    if not math.isfinite(sum((await session.controller.status()).position_mm)):
+        return
     while True:
         status = await session.controller.status()
         if math.dist(status.position_mm, start_mm) < START_MM and status.position_mm == before:
@@ -186,7 +189,7 @@ def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
     keep = np.concatenate([[True], np.diff(at) > 0.0])
     places: F2 = np.array([s.position_mm for s in heard.statuses])[keep]
     line = places[int(np.argmax(np.linalg.norm(places - places[0], axis=1)))] - places[0]
-    if at[keep].size < 20 or not line.any():
+    if at[keep].size < 20 or not line.any() or not np.isfinite(places).all():
         return to_controller, None
     along = (places - places[0]) @ (line / np.linalg.norm(line))
     inside = (to_controller(t) > at[0]) & (to_controller(t) < at[-1])
@@ -232,9 +235,8 @@ def _record(one: ListenRequest, reading: DwellReading | None, middle_s: float, h
         "direction": one.direction,
         "status": near.status,
         "signal_permille": near.signal_permille,
-        "air_temp_c": near.air_temp_c,
-        "air_pressure_pa": near.air_pressure_pa,
         "feed_mm_min": 0.0,
+        **air_doc(near),
     }
 
 

@@ -10,6 +10,7 @@ from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
 
+from abbe.drivers.api import only_listens, resolution_mm
 from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.campaigns.campaign_run import (
     BarBreaks,
@@ -30,7 +31,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session, notes_since
 from abbe.service.domain.measured import DISK_FULL, this_process
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
-from abbe.service.errors import AbbeError, Aborted, DiskFull, RunInterrupted, Stopped, StoreError
+from abbe.service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
@@ -143,17 +144,24 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
     """Add a campaign to the store; return its number and clock zero (controller time, us). ``more``: further fields of its document."""
     machine_id = await store.write(store.machines.add, site.name, site.doc)
     status = await session.controller.status()
-    comp = await session.controller.comp_status()
+    laser_mm = 1e-7 if session.laser is None else resolution_mm(session.laser)
+    table = await _table_in_force(session)
     doc = {
         "ctrl0_us": status.ctrl_us,
-        "active_bank": comp.active_bank,
-        "table_crc": comp.bank_crc[comp.active_bank],
-        "boot_id": comp.boot_id,
+        **({} if table is None else {"active_bank": table["bank"], "table_crc": table["crc"], "boot_id": table["boot_id"]}),
         "current_model": {"includes": ["rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"], "errors": None},
-        "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": 1e-7}},
+        "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": laser_mm}},
         "temperature_sensors": False,
     } | (more or {})
     return await store.write(store.campaigns.add, machine_id, name, doc), status.ctrl_us
+
+
+async def _table_in_force(session: Session) -> dict[str, int] | None:
+    """Return the compensation table in force as in a run's document; None for a control that shows none."""
+    if only_listens(session.controller):
+        return None
+    comp = await session.controller.comp_status()
+    return {"bank": comp.active_bank, "crc": comp.bank_crc[comp.active_bank], "gen": comp.gen, "boot_id": comp.boot_id}
 
 
 @dataclass(frozen=True, slots=True)
@@ -200,6 +208,8 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     clock, options = clock or SystemClock(), options or MeasureOptions()
     control, resumed = options.control or Control(), options.resumed
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
+    if only_listens(session.controller):
+        raise ConfigError("this control can only be listened to: Abbe does not move it", "start an NC program there, and use `abbe listen`")
     await check_devices(session, plan, air=site.watching.air_c is not None)
     if resumed is not None:
         campaign = resumed.campaign
@@ -390,22 +400,15 @@ def live_view(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) 
 async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
     """Return the start document of a run. Its mounting time is preliminary for a test that mounts; the end document has `mounted_us`."""
     status = await session.controller.status()
-    comp = await session.controller.comp_status()
+    table = await _table_in_force(session)
     ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
     if not test.mounts:
         set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
-    acting = status.compensation_on
     doc: dict[str, Any] = {
         "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
         "machine": site.doc,
         "ctrl0_us": ctrl0_us,
-        "table": {
-            "bank": comp.active_bank,
-            "crc": comp.bank_crc[comp.active_bank],
-            "gen": comp.gen,
-            "boot_id": comp.boot_id,
-            "acting": acting,
-        },
+        **({} if table is None else {"table": table | {"acting": status.compensation_on}}),
         "clock": {"utc": clock.utc().isoformat(), "host_s": clock.monotonic_s(), "ctrl_us": status.ctrl_us},
         "versions": {"abbe": version("abbe"), "python": platform.python_version()},
     }

@@ -8,6 +8,7 @@ aligned and zeroed only when the laser is mounted during the campaign.
 from __future__ import annotations
 
 import asyncio
+import math
 from collections.abc import Awaitable, Callable, Collection, Iterable
 from dataclasses import dataclass, field
 from datetime import date
@@ -127,7 +128,7 @@ def check_sensors(name: str, reading: LaserReading) -> None:
         ("air temperature", reading.air_temp_c, AIR_C, "C"),
         ("air pressure", reading.air_pressure_pa, AIR_PA, "Pa"),
     ):
-        if not low <= value <= high:
+        if not (low <= value <= high or math.isnan(value)):
             detail = f"its {what} reads {value:g} {unit}, which no workshop has"
             raise WrongDevice(name, "read", detail, "is the sensor connected? is this the laser?")
 

@@ -11,6 +11,7 @@ from abbe.service.cli.administration.serve import serve
 from abbe.service.cli.administration.system import SIM_SETTINGS, check_config, schema, sim, version
 from abbe.service.cli.administration.user import key, user
 from abbe.service.cli.demo import demo
+from abbe.service.cli.device import device
 from abbe.service.cli.form import CORRECT, MANAGE, MEASURE, UNDERSTAND, WATCH, give_form
 from abbe.service.cli.measure import correct, listen, measure
 from abbe.service.cli.plan import plan
@@ -36,6 +37,7 @@ app = typer.Typer(
 
 app.command("demo", rich_help_panel=MEASURE)(demo)
 app.command("check-config", rich_help_panel=MEASURE)(check_config)
+app.add_typer(device, name="device", rich_help_panel=MEASURE)
 app.command("plan", rich_help_panel=MEASURE)(plan)
 app.command("measure", rich_help_panel=MEASURE)(measure)
 app.command("listen", rich_help_panel=MEASURE)(listen)

@@ -278,10 +278,11 @@ async def verification_before(session: Session, store: Store, site: Site, campai
 
 
 @asynccontextmanager
-async def ready_session(store: Store, site: Site, *, accept_table: bool = False) -> AsyncIterator[Session]:
+async def ready_session(store: Store, site: Site, *, accept_table: bool = False, listening: bool = False) -> AsyncIterator[Session]:
     """Open the machine's devices; roll back an interrupted push first, so that nothing is measured with its table.
 
-    ``accept_table``: the person at the console vouches for a table in force that this database did not push.
+    ``accept_table``: the person at the console vouches for a table in force that this database did not push. ``listening``: an operator
+    moves the machine.
     """
     from abbe.service.cli.running import person_at_console
     from abbe.service.compensation.proposals import by_whom
@@ -293,7 +294,8 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False)
 
     with lock_machine(site.urls.cnc):
         accept_by = by_whom() if accept_table else ""
-        async with recovered_session(store, site, ask=person_at_console(), accept_by=accept_by, report=report) as session:
+        ask = person_at_console()
+        async with recovered_session(store, site, ask=ask, accept_by=accept_by, report=report, listening=listening) as session:
             yield session
 
 
@@ -341,7 +343,7 @@ def listen(
     plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{title} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
 
     async def work(store: Store) -> None:
-        async with ready_session(store, site, accept_table=accept_table) as session:
+        async with ready_session(store, site, accept_table=accept_table, listening=True) as session:
             await listen_campaign(session, store, site, plan, lambda text: typer.echo(text, err=as_json))
 
     with Store.open(loaded.database_url) as store:

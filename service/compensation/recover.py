@@ -12,7 +12,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
 
-from abbe.drivers.api import BankState, Controller, Identity, TableController
+from abbe.drivers.api import BankState, Controller, Identity, TableController, only_listens
 from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.clock import Clock, SystemClock
@@ -79,6 +79,8 @@ async def finish_push(
         As for `recover`.
     """
     done = await _finish_last(controller, store, site, clock or SystemClock())
+    if only_listens(controller) and not accept_by:  # it shows no table that could be another than ours
+        return done
     try:
         accepted = await accept_strange(controller, store, site, accept_by) if accept_by else None
         await check_in_force(controller, store, site)
@@ -254,6 +256,7 @@ async def recovered_session(
     *,
     accept_by: str = "",
     report: Callable[[str], object] | None = None,
+    listening: bool = False,
 ) -> AsyncIterator[Session]:
     """Open a machine's devices; `recover` runs after the controller is open and before any other device.
 
@@ -261,7 +264,7 @@ async def recovered_session(
     ----------
     urls : DeviceUrls, optional
         Default: all devices of the machine file.
-    ask, accept_by
+    ask, listening, accept_by
         Passed to `open_session` and `recover`.
     report : callable, optional
         Receives what recovery did, before the other devices are opened.
@@ -277,7 +280,7 @@ async def recovered_session(
         if done is not None and report is not None:
             report(done)
 
-    async with open_session(urls or site.urls, ask, first=first) as session:
+    async with open_session(urls or site.urls, ask, first=first, listening=listening) as session:
         yield replace(session, recovered=True)
 
 

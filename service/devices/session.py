@@ -262,11 +262,14 @@ async def no_console(text: str) -> None:
 
 
 @asynccontextmanager
-async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First | None = None) -> AsyncIterator[Session]:
+async def open_session(
+    urls: DeviceUrls, ask: Ask = no_console, *, first: First | None = None, listening: bool = False
+) -> AsyncIterator[Session]:
     """Open and identify every configured device; always close all of them at the end.
 
     ``ask`` asks the person at the console. ``first`` runs on the open controller before any other device is opened
-    (`abbe.service.compensation.recover`); its errors end the session.
+    (`abbe.service.compensation.recover`); its errors end the session. ``listening``: an operator moves the machine, so the control need not
+    be connected (`registry.no_controller`).
 
     Raises
     ------
@@ -277,7 +280,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
     DevicesNotReady
         Several devices failed; all are tried, and named in one line.
     """
-    if urls.cnc is None:
+    if urls.cnc is None and not listening:
         raise ConfigError("no controller configured", "add cnc = ... under [devices] of the machine file")
     async with AsyncExitStack() as stack:
         troubles: list[DriverError] = []
@@ -291,7 +294,7 @@ async def open_session(urls: DeviceUrls, ask: Ask = no_console, *, first: First 
             stack.push_async_callback(found.close)
             return found
 
-        found = await opened(registry.open_controller(urls.cnc))
+        found = registry.no_controller() if urls.cnc is None else await opened(registry.open_controller(urls.cnc))
         controller = None if found is None else noted(found)
         if controller is not None and first is not None:
             await first(controller)

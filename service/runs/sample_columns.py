@@ -296,6 +296,7 @@ def _u_mm(reading_nm: Sequence[int]) -> float:
     return float(np.std(reading_nm, ddof=1) * 1e-6 / np.sqrt(n)) if n > 1 else 0.0
 
 
+_AIR = {"temp_air_C": "air_temp_c", "pressure_air_Pa": "air_pressure_pa"}
 MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""
 
@@ -314,9 +315,9 @@ def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
     Returns
     -------
     Columns
-        With ``temp_air_C``, ``pressure_air_Pa``, ``status``, ``signal_permille``. Deviations count from the first record, or from the
-        laser's zero if that record is missing. A missing reading is a row with the commanded position, deviation 0 and ``valid`` 0, so
-        that rows still match standstills.
+        With ``status``, ``signal_permille``, and ``temp_air_C``, ``pressure_air_Pa`` if every record has them. Deviations count from the
+        first record, or from the laser's zero if that record is missing. A missing reading is a row with the commanded position, deviation
+        0 and ``valid`` 0, so that rows still match standstills.
     """
     first = records[0] if records else {}
     beam = start.setup["nominal_beam"]
@@ -328,8 +329,7 @@ def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
         deviation_mm=np.array([_deviation_mm(one, first, beam) for one in records], dtype=np.float64),
         valid=np.array([not (one.get("missing") or beam_is_gone(one["status"])) for one in records], dtype=np.bool_),
         further={
-            "temp_air_C": _numbers(records, "air_temp_c"),
-            "pressure_air_Pa": _numbers(records, "air_pressure_pa"),
+            **{column: _numbers(records, key) for column, key in _AIR.items() if all(key in one for one in records)},
             "status": np.array([one["status"] for one in records], dtype=np.int64),
             "signal_permille": np.array([one["signal_permille"] for one in records], dtype=np.int64),
         },

@@ -7,7 +7,7 @@ import math
 from collections.abc import Awaitable, Callable
 from typing import Any
 
-from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point, air_is_compensated, bar_is_out, bar_is_valid
+from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point, air_doc, air_is_compensated, bar_is_out, bar_is_valid
 from abbe.drivers.errors import Refused
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
@@ -343,7 +343,6 @@ class Runner:
             "displacement_tenth_nm": reading.displacement_tenth_nm,
             "status": reading.status,
             "signal_permille": reading.signal_permille,
-            "air_temp_c": reading.air_temp_c,
-            "air_pressure_pa": reading.air_pressure_pa,
             "feed_mm_min": 0.0,
+            **air_doc(reading),
         }

@@ -23,16 +23,18 @@ environment variable such as `ABBE_MQTT__URL` replaces a key. An unknown key is 
 def page() -> str:
     """The whole page."""
     schema = MachineFile.model_json_schema()
-    return _HEAD + "".join(_sections(schema, schema, "", schema["description"]))
+    return _HEAD + "".join(sections(schema, schema, "", schema["description"]))
 
 
-def _sections(schema: dict[str, Any], part: dict[str, Any], name: str, purpose: str) -> Iterator[str]:
+def sections(schema: dict[str, Any], part: dict[str, Any], name: str, purpose: str) -> Iterator[str]:
+    """One table of keys for a section, then those of the sections in it."""
     rows, below = [], []
     for key, value in part["properties"].items():
         inner = _inner(schema, value)
         if inner and {"X", "Y", "Z"} != set(inner["properties"]):
             listed = value.get("type") == "array"
             place = f"{name.strip('[]')}.{key}" if name else key
+            place += ".NAME" if "additionalProperties" in value else ""
             below.append((inner, f"[{place}]" if listed else place, value.get("description", inner["description"])))
         else:
             said = value.get("description") or (inner["description"] if inner else "")
@@ -44,13 +46,15 @@ def _sections(schema: dict[str, Any], part: dict[str, Any], name: str, purpose: 
         if inner["title"] in done:
             yield f"\n## [{place}]\n\n{said[:1].upper() + said[1:]}: the same keys as [{done[inner['title']]}].\n"
         else:
-            yield from _sections(schema, inner, place, said)
+            yield from sections(schema, inner, place, said)
         done[inner["title"]] = place
 
 
 def _inner(schema: dict[str, Any], value: dict[str, Any]) -> dict[str, Any] | None:
     """The section that a key holds, or a list of: none where it holds plain values."""
-    ref = value.get("$ref") or value.get("items", {}).get("$ref")
+    further = value.get("additionalProperties")
+    places = [value, value.get("items", {}), further if isinstance(further, dict) else {}, *value.get("anyOf", [])]
+    ref = next((place["$ref"] for place in places if "$ref" in place), None)
     found: dict[str, Any] | None = schema["$defs"][ref.rpartition("/")[2]] if ref else None
     return found
 

@@ -102,6 +102,8 @@ READS = frozenset(
         "effects",
         "errors",
         "check-config",
+        "device list",
+        "device test",
         "runs",
         "show",
         "export",

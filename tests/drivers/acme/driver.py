@@ -1,6 +1,6 @@
 """A driver as a customer would write it for another control: lines of text over TCP, micrometres, letters for conditions, words for banks.
 
-It imports `abbe.drivers` alone. An entry point ``acme = tests.drivers.acme.driver:open_acme`` of the group ``abbe.cnc`` is all that makes
+It imports `abbe.drivers` alone. An entry point ``acme = tests.drivers.acme.driver:DRIVER`` of the group ``abbe.drivers`` is all that makes
 it known (`tests/service/devices/test_second_controller.py`).
 """
 
@@ -122,3 +122,6 @@ class AcmeController:
 
     async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None:
         await self._ask("use", bank, expect_crc, expect_gen, owner)
+
+
+DRIVER = {"cnc": open_acme}

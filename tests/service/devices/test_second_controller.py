@@ -49,7 +49,7 @@ def driver_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = tmp_path / "site" / "acme_driver-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-driver\nVersion: 1.0\n")
-    (info / "entry_points.txt").write_text("[abbe.cnc]\nacme = tests.drivers.acme.driver:open_acme\nbroken = no_such_driver:open_it\n")
+    (info / "entry_points.txt").write_text("[abbe.drivers]\nacme = tests.drivers.acme.driver:DRIVER\nbroken = no_such_driver:IT\n")
     monkeypatch.syspath_prepend(str(info.parent))
     importlib.invalidate_caches()
 
@@ -80,7 +80,7 @@ def test_without_the_driver_its_scheme_is_not_known(tmp_path: Path) -> None:
 @pytest.mark.usefixtures("driver_installed")
 async def test_a_driver_that_cannot_be_loaded_is_named(tmp_path: Path) -> None:
     urls = machine_with(tmp_path, "broken://127.0.0.1:4000").urls
-    with pytest.raises(BadUrl, match="no_such_driver:open_it cannot be loaded"):
+    with pytest.raises(BadUrl, match="no_such_driver:IT cannot be loaded"):
         async with open_session(urls):
             raise AssertionError("opened")
 

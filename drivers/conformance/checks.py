@@ -1,0 +1,210 @@
+"""The checks of a device test. Each returns findings; none raises for what the device does wrong."""
+
+from __future__ import annotations
+
+import math
+import statistics
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from itertools import pairwise
+
+from abbe.drivers.conformance.probe import Probe, Sample
+from abbe.drivers.described.registers import ORDERS, decode, ours
+from abbe.drivers.described.tested import Finding, Verdict
+from abbe.drivers.device_file import SIZE, DeviceFile
+from abbe.drivers.errors import DriverError
+
+Ask = Callable[[str], Awaitable[object]]
+PASSED, FAILED, NOT_PROVED = Verdict.PASSED, Verdict.FAILED, Verdict.NOT_PROVED
+SAMPLES = 40
+WATCHED_S = 1.0
+CLOCK_FACTOR = 2.0
+"""The device's clock may differ from this computer's by this factor in a test of a second; a wrong unit differs by 1000."""
+FACTORS = (
+    (25.4, "inches are read as mm"),
+    (1e3, "the unit is 1000 times too large"),
+    (1e-3, "the unit is 1000 times too small"),
+    (2.0, "an interferometer that counts the path there and back?"),
+    (0.5, "half of the path?"),
+    (10.0, "the decimal point is one place off"),
+    (0.1, "the decimal point is one place off"),
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Move:
+    """A motion of known length, mm, and how exactly it is known (half-width, mm)."""
+
+    mm: float
+    tolerance_mm: float
+
+
+async def identity(probe: Probe, file: DeviceFile | None) -> list[Finding]:
+    """Identify twice; what identifies the device is its registers, its answer, or nothing."""
+    try:
+        first, second = await probe.identify(), await probe.identify()
+    except DriverError as error:
+        return [Finding("identity", FAILED, str(error))]
+    if first != second:
+        return [Finding("identity", FAILED, f"it is {first}, then {second}")]
+    named = f"{first.model} {first.serial_no}".strip()
+    if file is not None and not (file.identity or file.serial_no or (file.line is not None and file.line.who)):
+        return [Finding("identity", NOT_PROVED, f"{named}: nothing in the device file tells it from another device")]
+    found = [Finding("identity", PASSED, named)]
+    if file is not None and file.modbus is not None:
+        whole = any(SIZE[known.type] > 1 for known in file.identity)
+        text = (
+            f"{file.modbus.order}, by the identity registers" if whole else "no known content of two registers; the known motion shows it"
+        )
+        found.append(Finding("byte order", PASSED if whole else NOT_PROVED, text))
+    return found
+
+
+async def rate(probe: Probe, file: DeviceFile | None) -> list[Finding]:
+    """Take samples as fast as allowed: rate, jitter, freshness, the device's clock, noise."""
+    taken: list[Sample] = []
+    try:
+        await probe.zero()
+        while len(taken) < SAMPLES or taken[-1].host_s - taken[0].host_s < WATCHED_S:
+            taken.append(await probe.sample(taken[-1].number if taken else None))
+    except DriverError as error:
+        return [Finding("readings", FAILED, f"after {len(taken)} readings: {error}")]
+    apart = [b.host_s - a.host_s for a, b in pairwise(taken)]
+    mean_s = max(statistics.fmean(apart), 1e-9)
+    jitter = f"{statistics.pstdev(apart) * 1e3:.1f} ms standard deviation, {max(apart) * 1e3:.0f} ms longest"
+    found = [Finding("rate", PASSED, f"{1.0 / mean_s:.1f} readings a second; interval {mean_s * 1e3:.1f} ms, {jitter}")]
+    return [*found, _fresh(file), *_clock(taken), *_noise(taken, file)]
+
+
+def _fresh(file: DeviceFile | None) -> Finding:
+    if file is None:
+        return Finding("freshness", PASSED, "by its driver")
+    stamp = next((name for name in ("counter", "time") if name in file.values), None)
+    if stamp is not None:
+        return Finding("freshness", PASSED, f"every reading had a new {stamp}")
+    if file.line is not None:
+        return Finding(
+            "freshness", PASSED, "every reading was the answer to a question" if file.line.mode == "poll" else "a line of its own"
+        )
+    if file.limits.update_s is not None:
+        return Finding("freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s")
+    return Finding("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
+
+
+def _clock(taken: list[Sample]) -> list[Finding]:
+    host_s, device_s = taken[-1].host_s - taken[0].host_s, taken[-1].device_s - taken[0].device_s
+    if math.isnan(device_s):
+        return []
+    ratio = device_s / host_s
+    good = 1.0 / CLOCK_FACTOR < ratio < CLOCK_FACTOR
+    text = f"its time stamps advance {device_s:.2f} s in {host_s:.2f} s"
+    return [Finding("clock", PASSED if good else FAILED, text if good else f"{text}: is the unit of values.time right?")]
+
+
+def _noise(taken: list[Sample], file: DeviceFile | None) -> list[Finding]:
+    found = []
+    for name in taken[0].values:
+        values = [sample.values[name] for sample in taken]
+        unit, scale = ("um", 1e3) if name in ("displacement", "x", "y", "z") else ("", 1.0)
+        if not all(map(math.isfinite, values)):
+            found.append(Finding(f"noise {name}", FAILED, "a reading is not a number"))
+            continue
+        steps = sorted({abs(b - a) for a, b in pairwise(values)} - {0.0})
+        step = f", smallest step {steps[0] * scale:.4g} {unit}" if steps else ""
+        found.append(Finding(f"noise {name}", PASSED, f"standard deviation {statistics.pstdev(values) * scale:.3g} {unit} at rest{step}"))
+    return found
+
+
+async def motion(probe: Probe, file: DeviceFile | None, move: Move, ask: Ask) -> list[Finding]:
+    """Have the target (or each axis) moved a known way and back: sign, scale, unit, byte order."""
+    found = []
+    for name in probe.moved:
+        try:
+            found.append(await _moved(probe, file, name, move, ask))
+        except DriverError as error:
+            found.append(Finding(f"motion {name}", FAILED, str(error)))
+    return found
+
+
+async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, ask: Ask) -> Finding:
+    about, what = f"{move.mm:g} +- {move.tolerance_mm:g} mm", f"motion {name}"
+    before, before_words = await _mean(probe, name), await _words(probe, name)
+    await ask(f"Move the target {about} AWAY FROM the instrument." if name == "displacement" else f"Move axis {name.upper()} by +{about}.")
+    after, after_words = await _mean(probe, name), await _words(probe, name)
+    got = after - before
+    wrong = wrong_motion(got, move)
+    if wrong:
+        order = _other_order(file, name, (before_words, after_words), move)
+        return Finding(what, FAILED, order or wrong)
+    await ask("Move it back to where it was.")
+    back = await _mean(probe, name) - before
+    if abs(back) > move.tolerance_mm:
+        return Finding(what, FAILED, f"back at the start it reads {back:+.4f} mm: it lost counts, or slipped")
+    share = 100.0 * move.tolerance_mm / abs(move.mm)
+    return Finding(what, PASSED, f"{move.mm:g} mm read as {got:.4f} mm and {back:+.4f} mm back: sign right, scale right to {share:.2g} %")
+
+
+async def _mean(probe: Probe, name: str) -> float:
+    number, values = None, []
+    for _ in range(5):
+        sample = await probe.sample(number)
+        number = sample.number
+        values.append(sample.values[name])
+    return statistics.fmean(values)
+
+
+async def _words(probe: Probe, name: str) -> tuple[int, ...]:
+    return (await probe.raw()).get(name, ())
+
+
+def wrong_motion(got_mm: float, move: Move) -> str:
+    """Name what is wrong with a motion as it was read; empty if nothing is."""
+    if abs(got_mm - move.mm) <= move.tolerance_mm:
+        return ""
+    read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"
+    if abs(got_mm) <= move.tolerance_mm:
+        return f"stuck: {read}: it does not follow the target"
+    ratio = got_mm / move.mm
+    sign = "sign: it grows the wrong way, turn sign in the device file" if ratio < 0 else ""
+    if abs(abs(got_mm) - abs(move.mm)) <= move.tolerance_mm:
+        return f"{sign} ({read})"
+    share = move.tolerance_mm / abs(move.mm)
+    known = next((f" ({why})" for factor, why in FACTORS if abs(abs(ratio) / factor - 1.0) <= share), "")
+    scale = f"scale: {read}, {abs(ratio):.4g} times{known}; divide scale in the device file by {abs(ratio):.6g}"
+    return "; ".join(filter(None, (sign, scale)))
+
+
+def _other_order(file: DeviceFile | None, name: str, words: tuple[tuple[int, ...], ...], move: Move) -> str:
+    """Name the byte order in which the registers would have read the motion; empty if there is none."""
+    if file is None or file.modbus is None or not all(words):
+        return ""
+    value = file.values[name]
+    used = value.order or file.modbus.order
+    for order in ORDERS:
+        before, after = (ours(value, decode(one, value.type, order)) for one in words)
+        if order != used and abs(after - before - move.mm) <= move.tolerance_mm:
+            return f"byte order: in order {order} the registers read {after - before:.4f} mm, in {used} they do not; change order"
+    return ""
+
+
+async def quality(probe: Probe, file: DeviceFile | None, ask: Ask) -> Finding:
+    """Have the beam blocked or the plunger lifted: the reading must become invalid."""
+    bad = (
+        sorted({flag.means for flag in file.flags} & {"beam lost", "no reflector", "out of range", "fault"}) if file is not None else ["?"]
+    )
+    if not bad:
+        return Finding("quality", NOT_PROVED, "the device file names no flag of an invalid reading")
+    if not probe.moved:
+        return Finding("quality", NOT_PROVED, "not tried for this kind")
+    try:
+        await ask("Block the beam, or lift the plunger out of its range.")
+        try:
+            await _mean(probe, probe.moved[0])
+        except DriverError as error:
+            await ask("Free it again.")
+            await probe.zero()
+            return Finding("quality", PASSED, f"an invalid reading is refused: {error.detail}")
+        await ask("Free it again.")
+    except DriverError as error:
+        return Finding("quality", FAILED, f"after the beam was free again: {error}")
+    return Finding("quality", FAILED, f"a blocked or lifted sensor still reads as valid; the device file expects {', '.join(bad)}")

@@ -1,0 +1,146 @@
+"""The whole test of a device (`abbe device test`), and the abilities that follow from what it proved."""
+
+from __future__ import annotations
+
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from urllib.parse import urlsplit
+
+from abbe.drivers.conformance.checks import Ask, Move, identity, motion, quality, rate
+from abbe.drivers.conformance.faults import faults
+from abbe.drivers.conformance.probe import ControlProbe, MeterProbe, Probe, SourceProbe
+from abbe.drivers.conformance.proxy import Proxy
+from abbe.drivers.described.control import ListenedControl
+from abbe.drivers.described.meter import DescribedMeter
+from abbe.drivers.described.opening import Described, described, open_source
+from abbe.drivers.described.tested import Ability, Finding, TestReport, Verdict
+from abbe.drivers.device_file import DeviceFile
+from abbe.drivers.errors import BadUrl, DriverError
+from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, SocketUrl, described_by, installed, parse_url
+from abbe.drivers.registry import open_controller, open_laser
+
+LATE_SHARE = 1.5
+"""A late reply comes after this many reply timeouts."""
+OWN_TIMEOUT_S = 1.0
+AT_REST_MM = 0.002
+POSITIONS = ("motion x", "motion y", "motion z")
+
+
+@dataclass(frozen=True, slots=True)
+class Options:
+    """How a device is tested: ``role`` of a device with a driver (laser or cnc); ``move``, ``ask``: None without a person beside it."""
+
+    role: str = "laser"
+    move: Move | None = None
+    ask: Ask | None = None
+    faults: bool = True
+
+
+async def device_test(text: str, options: Options, utc: str) -> TestReport:
+    """Test the device behind a URL.
+
+    Parameters
+    ----------
+    text : str
+        The URL; a report named in it is ignored.
+    utc : str
+        Present time, ISO 8601, for the report.
+
+    Raises
+    ------
+    BadUrl, BadDeviceFile
+        The device cannot even be tried.
+    WrongDevice, LinkDown, ReplyTimeout, BadFrame, DeviceFault
+        Another device answers, or none: there is nothing to test.
+    """
+    about = None if installed(text) is not None or not described_by(parse_url(text)) else described(parse_url(text))
+    file = None if about is None else about.file
+    open_direct = _opener(text, about, options.role)
+    probe = await open_direct()
+    try:
+        info = await probe.identify()
+        found = [*await identity(probe, file), *await rate(probe, file)]
+        if options.ask is not None and options.move is not None:
+            found += await motion(probe, file, options.move, options.ask)
+            found.append(await quality(probe, file, options.ask))
+        else:
+            found += [Finding(f"motion {name}", Verdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
+    finally:
+        await probe.close()
+    if options.faults:
+        found += await _faults(text, about, options.role)
+    kind = file.kind if file is not None else options.role
+    return TestReport(
+        text.partition("&tested=")[0], kind, info.model, info.serial_no, "" if about is None else about.sha256, utc,
+        abilities(kind, tuple(found)), tuple(found),
+    )  # fmt: skip
+
+
+def abilities(kind: str, found: tuple[Finding, ...]) -> tuple[Ability, ...]:
+    """Return what a device can be used for by the findings of its test.
+
+    A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was, and if no check failed.
+    No test of a file proves motion or tables: that is up to a driver and `abbe comp commission`.
+    """
+    if any(one.verdict is Verdict.FAILED for one in found):
+        return ()
+    passed = {one.check for one in found if one.verdict is Verdict.PASSED}
+    needed = {"freshness", *(POSITIONS if kind in ("position", "cnc") else ("motion displacement",))}
+    counts = kind in ("displacement", "laser", "position", "cnc") and needed <= passed
+    return (Ability.WATCH, Ability.DWELL) if counts else (Ability.WATCH,)
+
+
+def summary(report: TestReport) -> str:
+    """Return in one line what the device can be used for."""
+    if report.failed:
+        return "it cannot be used: " + "; ".join(one.check for one in report.failed)
+    if Ability.DWELL in report.abilities:
+        return "it can measure: its readings count at standstills, of an operator's NC program or of a motion that Abbe commands"
+    return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is Verdict.NOT_PROVED)
+
+
+def _opener(text: str, about: Described | None, role: str) -> Callable[[], Awaitable[Probe]]:
+    if about is not None:
+        return lambda: _probe_of(about.url, about.file)
+
+    async def by_driver() -> Probe:
+        if role == "laser":
+            return MeterProbe(await open_laser(text))
+        if role == "cnc":
+            return ControlProbe(await open_controller(text))
+        raise BadUrl(ascii(text), "test device", f"there is no test for the role {role!r}", "use laser or cnc")
+
+    return by_driver
+
+
+async def _probe_of(url: DeviceUrl, file: DeviceFile) -> Probe:
+    source = await open_source(url, file)
+    if file.kind == "displacement":
+        return MeterProbe(DescribedMeter(file, source))
+    return ControlProbe(ListenedControl(file, source)) if file.kind == "position" else SourceProbe(file, source)
+
+
+async def _faults(text: str, about: Described | None, role: str) -> list[Finding]:
+    """Test the device behind a proxy, which needs its address: a serial line, or host and port."""
+    table = None if about is None else about.file.modbus or about.file.line
+    proxy = Proxy(LATE_SHARE * (OWN_TIMEOUT_S if table is None else table.timeout_s))
+    limits = None if about is None else about.file.limits
+    close_mm = max(AT_REST_MM, 6e-3 * (limits.u or 0.0) if limits is not None else 0.0)
+    try:
+        if installed(text) is not None:
+            parts = urlsplit(text)
+            if not parts.hostname or not parts.port:
+                return [Finding("replies", Verdict.NOT_PROVED, "its URL has no host and port, so no proxy can stand before it")]
+            front = await proxy.front(SocketUrl(parts.hostname, parts.port))
+            opener = _opener(parts._replace(netloc=f"{front.host}:{front.port}").geturl(), None, role)
+        else:
+            url = parse_url(text) if about is None else about.url
+            if isinstance(url, FixtureTcpUrl | FixtureConsoleUrl):
+                raise BadUrl(ascii(text), "test device", "a fixture has no test", "use laser or cnc")
+            there = await proxy.front(url)
+            opener = _opener(str(there), None if about is None else Described(there, about.file, about.sha256), role)
+        return await faults(opener, proxy, close_mm)
+    except DriverError as error:
+        return [Finding("replies", Verdict.FAILED, str(error))]
+    finally:
+        await proxy.close()

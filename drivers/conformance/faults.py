@@ -1,0 +1,73 @@
+"""Replies that come late, twice, spoilt or not at all, and a cut connection: every reading is right or refused, and they go on."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable, Callable
+
+from abbe.drivers.conformance.probe import Probe, Sample
+from abbe.drivers.conformance.proxy import Fault, Proxy
+from abbe.drivers.described.tested import Finding, Verdict
+from abbe.drivers.errors import DriverError
+
+TRIES = 6
+"""Readings around each fault."""
+RECOVERS_S = 15.0
+"""Longest time until a reading is right again."""
+PAUSE_S = 0.2
+
+
+async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm: float) -> list[Finding]:
+    """Play every fault to a device at rest.
+
+    Parameters
+    ----------
+    open_at : callable
+        Opens the device behind the proxy.
+    close_mm : float
+        How far from the first reading a reading at rest may be, mm or degree C.
+    """
+    try:
+        probe = await open_at()
+    except DriverError as error:
+        return [Finding("replies", Verdict.FAILED, f"the device cannot be opened behind a proxy: {error}")]
+    try:
+        await probe.zero()
+        base = await probe.sample(None)
+        found = [await _played(probe, proxy, fault, base, close_mm) for fault in Fault if fault is not Fault.CUT or proxy.cuts]
+        return found if proxy.cuts else [*found, Finding(Fault.CUT.value, Verdict.NOT_PROVED, "a serial line has none: pull its plug")]
+    except DriverError as error:
+        return [Finding("replies", Verdict.FAILED, str(error))]
+    finally:
+        await probe.close()
+
+
+async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: Sample, close_mm: float) -> Finding:
+    name, before, refused, number = f"reply {fault.value}" if fault is not Fault.CUT else fault.value, proxy.done, "", base.number
+    clock = asyncio.get_running_loop().time
+    begun_s, good = clock(), 0
+    proxy.fault = fault
+    while good < TRIES or proxy.done == before:
+        if clock() - begun_s > RECOVERS_S:
+            return Finding(name, Verdict.FAILED, f"no right reading within {RECOVERS_S:g} s; the last error: {refused or 'none'}")
+        try:
+            sample = await probe.sample(number)
+        except DriverError as error:
+            refused, good = f"{type(error).__name__}: {error.detail}", 0
+            await asyncio.sleep(PAUSE_S)
+            await _zeroed(probe)
+            continue
+        off = {key: value for key, value in sample.values.items() if not abs(value - base.values[key]) <= close_mm}
+        if off:
+            return Finding(name, Verdict.FAILED, f"a wrong reading passed as right: {off}, at rest it was {dict(base.values)}")
+        number, good = sample.number, good + 1
+    took = f"right again after {clock() - begun_s:.1f} s"
+    return Finding(name, Verdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right")
+
+
+async def _zeroed(probe: Probe) -> None:
+    """After a new connection a zero may be lost; a device that is still silent is asked again by the next reading."""
+    try:
+        await probe.zero()
+    except DriverError:
+        return

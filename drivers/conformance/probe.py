@@ -1,0 +1,127 @@
+"""Devices of all kinds as one: numbered samples of named values, in mm or degree C."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Protocol
+
+from abbe.drivers.api import Controller, DeviceInfo, DisplacementMeter
+from abbe.drivers.described.source import Source, physical
+from abbe.drivers.device_file import DeviceFile
+
+MM_PER_COUNT = 1e-7
+
+
+@dataclass(frozen=True, slots=True)
+class Sample:
+    """Values at one moment. ``host_s``: arrival, ``device_s``: time by the device (NaN: it has no clock), ``number``: never wraps."""
+
+    host_s: float
+    device_s: float
+    number: int
+    values: Mapping[str, float]
+
+
+class Probe(Protocol):
+    """A device under test. ``moved``: names of its values that follow a motion; ``raw``: registers of its values, if it has any."""
+
+    name: str
+    moved: tuple[str, ...]
+
+    async def identify(self) -> DeviceInfo: ...
+    async def zero(self) -> None: ...
+    async def sample(self, after: int | None) -> Sample: ...
+    async def raw(self) -> Mapping[str, tuple[int, ...]]: ...
+    async def close(self) -> None: ...
+
+
+class MeterProbe:
+    """A displacement meter; its samples are those that a measurement would accept."""
+
+    moved: tuple[str, ...] = ("displacement",)
+
+    def __init__(self, meter: DisplacementMeter) -> None:
+        self._meter = meter
+        self.name: str = getattr(meter, "name", "meter")
+        self.file: DeviceFile | None = getattr(meter, "file", None)
+
+    async def identify(self) -> DeviceInfo:
+        return await self._meter.identify()
+
+    async def zero(self) -> None:
+        await self._meter.clear_beam()
+        await self._meter.zero()
+
+    async def sample(self, after: int | None) -> Sample:
+        reading = await self._meter.read(after_count=after)
+        timed = self.file is None or "time" in self.file.values
+        device_s = reading.device_us * 1e-6 if timed else float("nan")
+        return Sample(reading.host_s, device_s, reading.sample_count, {"displacement": reading.displacement_tenth_nm * MM_PER_COUNT})
+
+    async def raw(self) -> Mapping[str, tuple[int, ...]]:
+        return await raw_of(self._meter)
+
+    async def close(self) -> None:
+        await self._meter.close()
+
+
+class ControlProbe:
+    """The positions of a control."""
+
+    moved: tuple[str, ...] = ("x", "y", "z")
+
+    def __init__(self, control: Controller) -> None:
+        self._control = control
+        self.name: str = getattr(control, "name", "control")
+        self._number = 0
+
+    async def identify(self) -> DeviceInfo:
+        return await self._control.identify()
+
+    async def zero(self) -> None:
+        return
+
+    async def sample(self, after: int | None) -> Sample:
+        status = await self._control.status()
+        self._number += 1
+        return Sample(status.host_s, float("nan"), self._number, dict(zip("xyz", status.position_mm, strict=True)))
+
+    async def raw(self) -> Mapping[str, tuple[int, ...]]:
+        return await raw_of(self._control)
+
+    async def close(self) -> None:
+        await self._control.close()
+
+
+class SourceProbe:
+    """A described device of which only the values matter, such as a temperature logger."""
+
+    moved: tuple[str, ...] = ()
+
+    def __init__(self, file: DeviceFile, source: Source) -> None:
+        self._file, self._source = file, source
+        self.name = source.name
+
+    async def identify(self) -> DeviceInfo:
+        return await self._source.identify()
+
+    async def zero(self) -> None:
+        return
+
+    async def sample(self, after: int | None) -> Sample:
+        found = await self._source.snapshot()
+        values = {name: physical(self._file, found.counts, name) for name in self._file.values}
+        return Sample(found.host_s, float("nan"), found.number, values)
+
+    async def raw(self) -> Mapping[str, tuple[int, ...]]:
+        return (await self._source.snapshot()).words
+
+    async def close(self) -> None:
+        await self._source.close()
+
+
+async def raw_of(device: object) -> Mapping[str, tuple[int, ...]]:
+    """Return the registers of a described device's values, to try other byte orders; empty for other devices."""
+    source: Source | None = getattr(device, "source", None)
+    return {} if source is None else (await source.snapshot()).words

@@ -1,0 +1,199 @@
+"""A described displacement sensor as a `abbe.drivers.api.DisplacementMeter`: laser, scale, digital indicator."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+from abbe.drivers.api import DeviceInfo, LaserFlag, LaserReading
+from abbe.drivers.described.registers import TO_OURS
+from abbe.drivers.described.source import Snapshot, Source, meanings, physical
+from abbe.drivers.device_file import SIZE, DeviceFile
+from abbe.drivers.errors import DeviceFault, NotProved, Refused, ReplyTimeout
+
+FLAGS = {
+    "beam lost": LaserFlag.BEAM_LOST,
+    "no reflector": LaserFlag.NO_REFLECTOR,
+    "signal low": LaserFlag.SIGNAL_LOW,
+    "out of range": LaserFlag.BEAM_LOST,
+    "fault": LaserFlag.BEAM_LOST,
+}
+LOSES_ZERO = {"beam lost", "no reflector", "fault"}
+"""States after which an incremental instrument must be zeroed anew."""
+TENTH_NM_PER_MM = 1e7
+NEW_S = 2.0
+"""Longest wait for a new reading; a device that shows an old one longer is stuck."""
+ZEROED_MM = 0.05
+
+
+class DescribedMeter:
+    """A displacement sensor. Its zero is its own command, or the reading at that moment, which is then subtracted.
+
+    A reading is new if the device's counter or time stamp has changed. Without both, it is new if it was asked for ``update_s`` of the
+    device file later (registers), or because it is the answer to a question of its own, or a line of its own (lines of text).
+    """
+
+    def __init__(self, file: DeviceFile, source: Source) -> None:
+        self.file, self.source = file, source
+        self.name, self.incidents = source.name, source.incidents
+        self._zero_mm: float | None = None
+        self._raw: dict[str, float] = {}
+        self._total: dict[str, float] = {}
+        self._epoch = -1
+        self._count = 0
+        self._not_before: int | None = None
+
+    @property
+    def resolution_mm(self) -> float:
+        """Smallest step of the readings, mm: by the device file, else of one count."""
+        value = self.file.values["displacement"]
+        return TO_OURS[value.unit][0] * (self.file.limits.resolution or value.scale)
+
+    async def identify(self) -> DeviceInfo:
+        """Identify the device anew; its zero is taken again afterwards. Raises WrongDevice and the errors of communication."""
+        info = await self.source.identify()
+        self._zero_mm = None
+        self._raw.clear()
+        return info
+
+    async def zero(self) -> None:
+        """Take the present position as zero.
+
+        Raises
+        ------
+        DeviceFault
+            The reading is not valid now.
+        Refused
+            The device acknowledged its zero command but does not read zero.
+        ReplyTimeout, LinkDown, BadFrame
+            Communication failed.
+        """
+        snapshot = await self._new(None)
+        if bad := meanings(self.file, snapshot.counts) & FLAGS.keys():
+            raise DeviceFault(self.name, "zero", ", ".join(sorted(bad)), "free beam or plunger first")
+        if self.file.zero is not None:
+            await self.source.command(self.file.zero, "zero")
+            await asyncio.sleep(self.file.limits.update_s or 0.0)
+            snapshot = await self._new(self._count)
+            found_mm = physical(self.file, snapshot.counts, "displacement")
+            if not abs(found_mm) < ZEROED_MM:
+                raise Refused(self.name, "zero", f"it reads {found_mm:.4f} mm after its zero command", "does the command fit the device?")
+            self._zero_mm = 0.0
+        else:
+            self._zero_mm = physical(self.file, snapshot.counts, "displacement")
+        self._not_before = self._count
+
+    async def clear_beam(self) -> None:
+        """Clear a latched loss, if the device has a command for that; errors as for `zero`."""
+        if self.file.clear is not None:
+            await self.source.command(self.file.clear, "clear")
+
+    async def set_environment_compensation(self, on: bool) -> None:
+        """Do nothing, because such a device has no switch for it.
+
+        Raises
+        ------
+        NotProved
+            The device measures with light and does not correct for the air, or always corrects.
+        """
+        if on and self.file.air == "vacuum":
+            detail = "it does not correct its wavelength for the air: lengths would be some 270 ppm too large"
+            raise NotProved(self.name, "switch environmental compensation", detail, "use an instrument that compensates")
+        if not on and self.file.air == "compensated":
+            raise NotProved(self.name, "switch environmental compensation", "it cannot be switched off", "measure with it")
+
+    async def read(self, *, after_count: int | None = None) -> LaserReading:
+        """Wait for a reading after the last zero and after sample number ``after_count`` (None: any), and return it.
+
+        Raises
+        ------
+        DeviceFault
+            The reading is not valid: beam lost, out of range, a fault, or not zeroed since.
+        ReplyTimeout
+            No new reading in time, or the counter is stuck.
+        Rebooted, WrongDevice, LinkDown, BadFrame
+            The device restarted or is another one, or communication failed.
+        """
+        floor = max((c for c in (after_count, self._not_before) if c is not None), default=None)
+        snapshot = await self._new(floor)
+        self._not_before = None
+        bad = meanings(self.file, snapshot.counts) & FLAGS.keys() - {"signal low"}
+        reading = self._reading(snapshot)
+        if bad:
+            raise DeviceFault(self.name, "read", ", ".join(sorted(bad)), "free beam or plunger, zero it, then repeat this test")
+        if self._zero_mm is None:
+            raise DeviceFault(self.name, "read", "not zeroed since it was opened or lost its position", "zero it, then repeat this test")
+        return reading
+
+    async def peek(self) -> LaserReading:
+        """Read once, valid or not, new or not; errors of communication as for `read`."""
+        snapshot = await self.source.snapshot()
+        self._counted(snapshot)
+        return self._reading(snapshot)
+
+    async def close(self) -> None:
+        """Close the link. Closing twice does nothing."""
+        await self.source.close()
+
+    async def _new(self, after: int | None) -> Snapshot:
+        """Return a snapshot with a sample number above ``after``."""
+        clock = asyncio.get_running_loop().time
+        begun_s, update_s = clock(), self.file.limits.update_s
+        while True:
+            snapshot = await self.source.snapshot()
+            count = self._counted(snapshot)
+            stamped = "counter" in self.file.values or "time" in self.file.values
+            if (after is None or count > after) and (stamped or update_s is None or after is None or clock() - begun_s >= update_s):
+                return snapshot
+            if clock() - begun_s > NEW_S + (update_s or 0.0):
+                what = "counter" if "counter" in self.file.values else "time stamp"
+                detail = f"its {what} is stuck at {snapshot.counts['counter' if what == 'counter' else 'time']:g} for {NEW_S:g} s"
+                raise ReplyTimeout(self.name, "read", f"{detail}: the device repeats an old reading", "is it measuring? restart it")
+
+    def _counted(self, snapshot: Snapshot) -> int:
+        """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else ours."""
+        if snapshot.epoch != self._epoch:
+            self._epoch, self._zero_mm = snapshot.epoch, None
+        steps = [self._step(name, snapshot.counts[name]) for name in ("counter", "time") if name in self.file.values]
+        self._count += bool(steps[0]) if steps else 1
+        return self._count
+
+    def _step(self, name: str, raw: float) -> float:
+        """Add the change of a count that may wrap to its total, and return it."""
+        value, before = self.file.values[name], self._raw.get(name)
+        step = raw if before is None else raw - before
+        if self.file.modbus is not None and value.type[0] != "f":
+            step %= 1 << 16 * SIZE[value.type]
+        self._raw[name] = raw
+        self._total[name] = self._total.get(name, 0.0) + step
+        return step
+
+    def _reading(self, snapshot: Snapshot) -> LaserReading:
+        found = meanings(self.file, snapshot.counts)
+        mm = physical(self.file, snapshot.counts, "displacement")
+        if not math.isfinite(mm):
+            raise DeviceFault(self.name, "read", f"the displacement reads {mm}", "is a sensor connected?")
+        limits = self.file.limits.range_mm
+        if limits is not None and not limits[0] <= mm <= limits[1]:
+            found |= {"out of range"}
+        if found & LOSES_ZERO:
+            self._zero_mm = None
+        status = LaserFlag.COMPENSATED if self.file.air != "vacuum" else LaserFlag(0)
+        status |= LaserFlag.ZEROED if self._zero_mm is not None else LaserFlag(0)
+        for meaning in found & FLAGS.keys():
+            status |= FLAGS[meaning]
+        at_s = physical(self.file, self._total, "time") if "time" in self.file.values else snapshot.host_s
+        signal = physical(self.file, snapshot.counts, "signal")
+        permille = 1000 if math.isnan(signal) else round(signal * (10 if self.file.values["signal"].unit == "%" else 1))
+        return LaserReading(
+            host_s=snapshot.host_s,
+            sample_count=self._count,
+            device_us=round(at_s * 1e6),
+            displacement_tenth_nm=round((mm - (self._zero_mm or 0.0)) * TENTH_NM_PER_MM),
+            signal_permille=permille,
+            status=int(status),
+            air_temp_c=physical(self.file, snapshot.counts, "air_temperature"),
+            air_pressure_pa=physical(self.file, snapshot.counts, "air_pressure"),
+            humidity_percent=physical(self.file, snapshot.counts, "air_humidity"),
+            refractivity=float("nan"),
+        )

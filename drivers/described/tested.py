@@ -1,0 +1,112 @@
+"""What a device can do by the report of its test (`abbe device test`), and the gate: a job opens only what was proved for it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+from abbe.drivers.errors import NotProved
+
+FORMAT = "abbe-device-test/1"
+
+
+class Ability(StrEnum):
+    """What a device can be used for; each needs more proofs than the one before."""
+
+    WATCH = "watch"
+    """Its values can be shown."""
+    DWELL = "dwell"
+    """Its readings count: at standstills of an operator's NC program, or of a motion that Abbe commands."""
+    MOVE = "move"
+    """It moves a machine."""
+    TABLES = "tables"
+    """It holds compensation tables: two banks, read-back, compare-and-swap (`abbe comp commission` proves them)."""
+
+
+class Verdict(StrEnum):
+    """Outcome of one check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    NOT_PROVED = "not proved"
+    """It was not tried, or cannot be proved for this device."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One check: its name, outcome, and a sentence with the figures."""
+
+    check: str
+    verdict: Verdict
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class TestReport:
+    """Report of a device test. ``device_sha256``: of the device file, empty for a device with a driver; ``utc``: ISO 8601."""
+
+    __test__ = False  # pytest takes names that begin with Test
+    device: str
+    kind: str
+    model: str
+    serial_no: str
+    device_sha256: str
+    utc: str
+    abilities: tuple[Ability, ...]
+    findings: tuple[Finding, ...]
+
+    @property
+    def failed(self) -> tuple[Finding, ...]:
+        """The checks that failed."""
+        return tuple(one for one in self.findings if one.verdict is Verdict.FAILED)
+
+    def to_document(self) -> dict[str, Any]:
+        """Return the report as a JSON object."""
+        return {"format": FORMAT} | asdict(self)
+
+
+def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ability) -> None:
+    """Refuse a device whose report does not prove an ability.
+
+    Parameters
+    ----------
+    device : str
+        Its URL, for the error.
+    path : str
+        The report; empty: there is none.
+    sha256, serial_no : str
+        Of the device file, and of the device that answers now: the report must be about both.
+    needed : Ability
+        What the job needs.
+
+    Raises
+    ------
+    NotProved
+        No report, of another device or file, or without this ability; the message names the checks that failed or are missing.
+    """
+    remedy = f'run: abbe device test "{device.partition("&tested")[0]}" --out report.json, then add &tested=report.json to the URL'
+    if not path:
+        raise NotProved(device, f"open to {needed}", "its sign, scale and freshness are not proved yet", remedy)
+    try:
+        doc = json.loads(Path(path).read_text(encoding="utf-8"))
+        if not isinstance(doc, Mapping) or doc.get("format") != FORMAT:
+            raise ValueError("it is no report of a device test")
+        stated = {key: str(doc[key]) for key in ("device_sha256", "serial_no")}
+        abilities, findings = (
+            list(doc["abilities"]),
+            [(str(one["check"]), str(one["verdict"]), str(one["text"])) for one in doc["findings"]],
+        )
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise NotProved(device, "read test report", f"{path}: {error}", remedy) from None
+    if stated["device_sha256"] != sha256:
+        raise NotProved(device, f"open to {needed}", "the device file has changed since its test", remedy)
+    if stated["serial_no"] != serial_no:
+        detail = f"device {serial_no or 'without number'} answers, device {stated['serial_no'] or 'without number'} was tested"
+        raise NotProved(device, f"open to {needed}", detail, remedy)
+    if needed not in abilities:
+        why = "; ".join(f"{check}: {text}" for check, verdict, text in findings if verdict != Verdict.PASSED)
+        raise NotProved(device, f"open to {needed}", f"its test did not prove it: {why}", remedy)

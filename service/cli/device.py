@@ -1,0 +1,54 @@
+"""`abbe device`: test a device before it measures, and list the device files that come with Abbe."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+device = typer.Typer(no_args_is_help=True, help="Test devices, list the device files that come with Abbe.")
+
+
+@device.command("list")
+def list_files() -> None:
+    """List the device files that come with Abbe; `device=NAME` in a URL uses one."""
+    from abbe.drivers.device_file import SHIPPED, load
+
+    for path in sorted(SHIPPED.glob("*.toml")):
+        file, _ = load(path.stem)
+        typer.echo(f"{path.stem:24} {file.kind:13} {file.name}")
+
+
+@device.command("test")
+def try_device(
+    url: Annotated[str, typer.Argument(metavar="URL", help="Address of the device as in [devices], with device=FILE if one describes it.")],
+    role: Annotated[str, typer.Option(help="Of a device with a driver: laser or cnc.")] = "laser",
+    move: Annotated[float, typer.Option(metavar="MM", help="Known motion, mm, that a person makes when asked; 0: none.")] = 0.0,
+    tolerance: Annotated[float, typer.Option(metavar="MM", help="How exactly that motion is known, mm.")] = 0.05,
+    faults: Annotated[bool, typer.Option("--faults/--no-faults", help="Play late, doubled, spoilt and missing replies.")] = True,
+    out: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Keep the report; tested=FILE.json in the URL uses it.")] = None,
+) -> None:
+    """Test identity, rate, freshness, noise, sign, scale, quality bits and bad replies of a device; exit code 1 if a check failed."""
+    import asyncio
+    import json
+
+    from abbe.drivers.conformance.checks import Move
+    from abbe.drivers.conformance.device_test import Options, device_test, summary
+    from abbe.service.cli.running import person_at_console
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import ConfigError
+    from abbe.service.rendering.page_file import write_page
+
+    if move and not 0.0 < tolerance < 0.2 * abs(move):
+        raise ConfigError(f"--tolerance {tolerance:g} does not fit --move {move:g}", "give more than 0 and less than a fifth of the motion")
+    options = Options(role, Move(move, tolerance) if move else None, person_at_console() if move else None, faults)
+    report = asyncio.run(device_test(url, options, SystemClock().utc().isoformat()))
+    typer.echo(f"{report.kind}: {report.model} {report.serial_no}".rstrip())
+    for one in report.findings:
+        typer.echo(f"{one.verdict:10} {one.check}: {one.text}")
+    typer.echo(summary(report))
+    if out is not None:
+        write_page(json.dumps(report.to_document(), indent=2) + "\n", out)
+        typer.echo(f"report: {out}")
+    raise typer.Exit(1 if report.failed else 0)

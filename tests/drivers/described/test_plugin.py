@@ -1,0 +1,79 @@
+"""A meter with a protocol of its own: a module of some hundred lines and one entry point, and it is opened, tested and refused like all."""
+
+from __future__ import annotations
+
+import asyncio
+import importlib
+import struct
+from collections.abc import AsyncIterator
+from pathlib import Path
+from zlib import crc32
+
+import pytest
+
+from abbe.drivers.conformance.checks import Move
+from abbe.drivers.conformance.device_test import Options, device_test
+from abbe.drivers.described.tested import Ability
+from abbe.drivers.errors import BadUrl
+from abbe.drivers.registry import open_controller, open_laser
+from tests.drivers.acme import meter as driver
+
+LONGEST = 150
+
+
+class Device:
+    """The device: what it stands at, um; ``sign`` turns it round."""
+
+    def __init__(self) -> None:
+        self.um, self.sign, self.number, self.status = 0.0, 1.0, 0, 0
+
+    async def serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        while request := await reader.read(1):
+            self.number += 1
+            body = b"ACME0007" if request == b"i" else struct.pack("<Iid", self.number, self.status, self.sign * self.um)
+            answer = request + body
+            writer.write(answer + crc32(answer).to_bytes(4, "little"))
+        writer.close()
+
+    async def person(self, text: str) -> None:
+        self.um = 10_000.0 if "AWAY" in text else 0.0
+        self.status = int(text.startswith("Block"))
+
+
+@pytest.fixture
+async def device(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[tuple[Device, str]]:
+    info = tmp_path / "acme_meter-1.0.dist-info"
+    info.mkdir()
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-meter\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[abbe.drivers]\nacme-meter = tests.drivers.acme.meter:DRIVER\n")
+    monkeypatch.syspath_prepend(str(tmp_path))
+    importlib.invalidate_caches()
+    made = Device()
+    server = await asyncio.start_server(made.serve, "127.0.0.1", 0)
+    yield made, f"acme-meter://127.0.0.1:{server.sockets[0].getsockname()[1]}"
+    server.close()
+
+
+def test_a_driver_is_short() -> None:
+    assert driver.__file__ is not None
+    assert len(Path(driver.__file__).read_text().splitlines()) <= LONGEST
+
+
+async def test_it_passes_the_test_of_devices(device: tuple[Device, str]) -> None:
+    acme, url = device
+    report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person), "2026-11-26T00:00:00+00:00")
+    assert report.failed == ()
+    assert (report.model, report.serial_no, report.abilities) == ("acme meter", "ACME0007", (Ability.WATCH, Ability.DWELL))
+    acme.sign = -1.0
+    report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
+    assert [one.check for one in report.failed] == ["motion displacement"]
+    assert report.failed[0].text.startswith("sign: it grows the wrong way")
+
+
+async def test_a_driver_that_is_not_whole_is_refused_by_name(device: tuple[Device, str], monkeypatch: pytest.MonkeyPatch) -> None:
+    _, url = device
+    with pytest.raises(BadUrl, match="opens no cnc"):
+        await open_controller(url)
+    monkeypatch.delattr(driver.AcmeMeter, "peek")
+    with pytest.raises(BadUrl, match="meter:DRIVER lacks peek"):
+        await open_laser(url)

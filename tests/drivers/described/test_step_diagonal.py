@@ -1,0 +1,120 @@
+"""A stranger's meter measures step diagonals beside a machine without interface: an operator runs the NC program, Abbe listens."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abbe.drivers.errors import NotProved
+from abbe.models.arrays import F1, F2
+from abbe.service.campaigns.listen import listen_campaign
+from abbe.service.campaigns.measure import measure
+from abbe.service.cli import run as run_command
+from abbe.service.compensation.recover import recovered_session
+from abbe.service.config import load_machine
+from abbe.service.errors import ConfigError
+from abbe.service.runs.columns import load_run
+from abbe.service.sequences.nc.write import nc_program
+from abbe.service.sequences.recipes.recipe_file import read_recipe
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, site_of
+from abbe.service.storage.store import Store
+from tests.drivers.described.foreign import World
+from tests.drivers.described.test_device_test import kept, report_of
+from tests.service.sequences.nc_reader import read_gcode
+
+pytestmark = pytest.mark.timeout(180)
+DIAGONALS = ("ppp", "npp", "pnp", "ppn")
+DISTORTION: F2 = np.array([[60e-6, 25e-6, -30e-6], [0.0, -40e-6, 15e-6], [0.0, 0.0, 50e-6]])
+"""Deviation of the tool per mm of position: scales on the diagonal, squareness beside it. Any rotation of the whole is left out."""
+TRUTH = {"EXX.1": 3.6e-3, "EYY.1": -2.0e-3, "EZZ.1": 2.25e-3, "C0Y": -25e-6, "B0Z": -30e-6, "A0Z": -15e-6}
+"""The same as the solution states it: mm at half the stroke, and rad, obtuse angles positive."""
+MACHINE = """
+name = "mill"
+chain = "w-X-Y-b-Z-t"
+[stroke_mm]
+X = [0, 120]
+Y = [0, 100]
+Z = [0, 90]
+[devices]
+laser = "{url}"
+fixture = "fixture+console:"
+"""
+RECIPE = 'format = "abbe-recipe/1"\nname = "diagonals"\n' + "".join(
+    f'[[test]]\nkind = "diagonal"\nlabel = "{d}"\nsetup = "{d}"\ndiagonal = "{d}"\nsteps = 3\norder = "XYZ"\n' for d in DIAGONALS
+)
+
+
+def site(folder: Path, url: str) -> Site:
+    (folder / "mill.toml").write_text(MACHINE.format(url=url))
+    (folder / "recipe.toml").write_text(RECIPE)
+    return site_of(load_machine(folder / "mill.toml").machine)
+
+
+def blocks(text: str) -> list[list[tuple[str, F1, float]]]:
+    """Motions and dwells of an NC program, cut where it stops for a person."""
+    out: list[list[tuple[str, F1, float]]] = [[]]
+    for event in read_gcode(text, dwell="P_s"):
+        if event.kind == "halt":
+            out.append([])
+        else:
+            out[-1].append((event.kind, np.array(event.at), float(event.value)))
+    return out
+
+
+def track(part: list[tuple[str, F1, float]], beam: F1, at: F1) -> list[tuple[float, float]]:
+    """What the reflector does along the beam, mm over s, while the machine runs a part of the program from ``at`` on."""
+    s, start, out = 3.0, at, [(0.0, 0.0), (3.0, 0.0)]
+    for kind, target, value in part:
+        if kind == "go":
+            s += max(float(np.linalg.norm(target - at)) / (value / 60.0), 0.05)
+            at = target
+        else:
+            s += value
+        moved = at - start
+        out.append((s, float(beam @ (moved + DISTORTION @ moved))))
+    return out
+
+
+async def test_it_measures_and_the_runs_solve(url: str, world: World, tmp_path: Path, capsys) -> None:
+    report = kept(await report_of(url, world), tmp_path)
+    here = site(tmp_path, f"{url}&tested={report}")
+    title, recipes = read_recipe(tmp_path / "recipe.toml")
+    plan = CampaignPlan(title, tuple(recipe.plan(here.machine) for recipe in recipes))
+    parts = blocks(nc_program(here.name, here.machine, plan, "linuxcnc", here.nc).text)
+    runs = dict(zip(DIAGONALS, parts[1::2], strict=True))
+    starts = dict(zip(DIAGONALS, (part[-1][1] for part in parts[::2] if part), strict=True))
+    beams = {test.label: np.array(test.setup["nominal_beam"]) for test in plan.tests}
+
+    def operator(text: str) -> None:
+        label = text.partition(":")[0]
+        if "listening" in text:
+            world.run(track(runs[label], beams[label], starts[label]))
+
+    async def mounts(text: str) -> None:
+        return
+
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        async with recovered_session(store, here, ask=mounts, listening=True) as session:
+            with pytest.raises(ConfigError, match="can only be listened to"):
+                await measure(session, store, here, plan)
+            with pytest.raises(NotProved, match="no table is written into it"):
+                await session.controller.write_bank(0, b"")
+            await listen_campaign(session, store, here, plan, operator)
+        measured = {record.label: load_run(store, record.id) for record in store.runs.all(title)}
+    for label, run in measured.items():
+        columns = run.to_document()["columns"]
+        q = np.stack([columns[f"{axis}_mm"] for axis in "xyz"], axis=1)
+        assert np.array(columns["deviation_mm"]) == pytest.approx((q - q[0]) @ DISTORTION.T @ beams[label], abs=4e-4)
+        assert columns["temp_air_C"] == pytest.approx([20.5] * len(q), abs=1e-3)
+        assert run.table.crc is None
+    code = run_command(["solve", title, "--machine", str(tmp_path / "mill.toml"), "--json"])
+    out, err = capsys.readouterr()
+    assert code == 0, err
+    found = json.loads(out)["parameters"]
+    for name, truth in TRUTH.items():
+        assert abs(found[name]["value"] - truth) < 4.0 * found[name]["u"], name
+        assert found[name]["u"] < 0.1 * abs(truth), name
