@@ -19,14 +19,12 @@ from abbe.models.discovery.finding import finding
 from abbe.models.discovery.instrument_noise import unscaled
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
 from abbe.models.discovery.solved_model import predictions, solve
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping, extra_variance
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
 
-GATE = 1.3
-"""Readings below this multiple of the stick-slip speed are excluded from the search for mean effects, unless they exceed `MOST_GATED`."""
 MOST_GATED = 0.35
-"""If more than this share of all readings is below `GATE`, none is excluded."""
+"""If more than this share of all readings creeps (stick-slip), none is excluded from the search for mean effects."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
@@ -56,7 +54,7 @@ def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> Wh
         if f.name == "vibration":
             waves.append(_waves(problem, "XYZ".index(f.key), f.parameters["frequency_hz"]))
         elif f.name == "stick_slip":
-            loud = _slow(problem, "XYZ".index(f.key), f.parameters["v_c"])
+            loud = creeping(problem.paths, f)
             use = use * (1.0 - loud) if loud.mean() < MOST_GATED else use
         elif f.name == "unnamed_burst":
             use = use * (1.0 - _burst(problem, f.parameters["t0_s"], f.parameters["width_s"]))
@@ -78,10 +76,6 @@ def _waves(problem: WhitenedProblem, axis: int, frequency_hz: float) -> F2:
             column += 2
         start += path.n
     return out
-
-
-def _slow(problem: WhitenedProblem, axis: int, v_mm_s: float) -> F1:
-    return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < GATE * v_mm_s) * float(p.kind == "bar") for p in problem.paths])
 
 
 def _burst(problem: WhitenedProblem, t0_s: float, width_s: float) -> F1:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import permutations
 
 import numpy as np
 
@@ -14,13 +15,13 @@ from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffe
 from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.experiment.additions import blind_spots
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
-from abbe.models.discovery.generic.unnamed_structures import is_unnamed
-from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit
+from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
+from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
 from abbe.models.discovery.localization import localize_signal, locate
-from abbe.models.discovery.selection import EXCLUDED, Rival, Selection
+from abbe.models.discovery.selection import APART, EXCLUDED, Rival, Selection, u_moment
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
 from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
 from abbe.models.probability import chi2_above
@@ -52,7 +53,7 @@ SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
 """Stick-slip and vibration are residues below this share of the strongest mean effect, on any axis: below 1 % of an effect with corners or
 waves (`ROUGH`), below 0.3 % of a smooth one, which leaves less that looks like scatter (a true stick-slip had 1.0 % of a pitch error)."""
 AXIS_SHARE = 0.02
-AT_TURNS = ("backlash", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
+AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """Effects at the reversals of one axis differ only in form: with less than `AXIS_SHARE` of its evidence, one is a residue of another."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
@@ -63,6 +64,9 @@ SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed
 """Groups of related effects (thermal courses, curves over the position, lags of drives): a deviation of one from its formula by a sixth,
 3 % of its evidence, resembles another of the group. In 345 cases (150 others for lags) ten false names had 0.2 to 2.9 % of the evidence of
 the strong effect, and one true name 9 %."""
+REST_SHARE = 0.1
+"""A name with less than this share of the evidence that nothing explains is a residue of that: whatever is unknown resembles some name a
+little. In cases whose effects were all found, nothing is left."""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name with less than this share of another's evidence, and more than this overlap of their signals, is a residue of the other."""
 STARTS = 2000.0
@@ -170,6 +174,8 @@ def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
     """Return the share of the evidence of ``big`` below which ``small`` is its residue (`residues`)."""
     if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
         return AXIS_SHARE
+    if small.name == "beam_outliers" and any(form.startswith("harmonics") for form in big.forms):
+        return SCATTER_SHARE  # readings beside the jumps of a saw-tooth
     grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
     clock = small.name in CLOCK and big.name in CLOCK
     lag = small.name in LAG and big.name in LAG and small.name != big.name
@@ -216,14 +222,18 @@ def finding(
     found, loud : mean and variance effects found. solved, rivals : solution with ``found``, and the rivals of each of these.
     predicted : predicted readings of every run by label, mm, without and with the effects.
     """
-    case, judgement = problem.case, _judge(problem, found, loud, solved, rivals)
+    case, floor = problem.case, floors(problem)
+    calm = np.prod([np.ones(problem.use.size), *(1.0 - creeping(problem.paths, f) for f in loud if f.name == "stick_slip")], axis=0)
+    rest = unexplained(problem, [f.pick for f in found], floor, calm)
+    judgement = _judge(problem, found, loud, solved, rivals, rest)
     is_named, unnamed = judgement.verdict == "named", judgement.unnamed
     fitted_setups = {r.path.setup for r in problem.runs}
     judged = [r for r in case.runs if r.deviation_mm is not None]
     residuals = [{r.path.label: left_over(r, p[r.path.label], fitted_setups) for r in judged} for p in predicted]
     agreement, unjudged = agreements(problem, solved, predicted[0]) if judgement.verdict == "none" else ((), ())
-    location, verdict, floor = locate(plain.paths, tuple(plain.by_run(plain.projection.residual))), judgement.verdict, floors(problem)
-    lack = lack_of_fit(problem, residuals[0], floor, agreement) if verdict == "none" else None
+    location, verdict = locate(plain.paths, tuple(plain.by_run(plain.projection.residual))), judgement.verdict
+    vague = verdict == "unknown" and unnamed[0].evidence < REST_SHARE * rest  # a place or time of this little is chance
+    lack = lack_of_fit(problem, residuals[0], floor, agreement) if verdict == "none" or vague else None
     if lack is not None:
         verdict, unnamed, location = "unknown", (lacking(lack),), lack
     elif verdict == "unknown":
@@ -258,16 +268,26 @@ def _judge(
     loud: Sequence[VarianceFinding],
     solved: SolvedModel,
     rivals: Sequence[Sequence[Rival]],
+    rest: float,
 ) -> _Judgement:
-    """Sort the findings into named effects, structures without a name, and residues of other effects."""
+    """Sort the findings into named effects, structures without a name, and residues of other effects or of what nothing explains.
+
+    ``rest``: evidence, in nats, of what all findings together leave above the noise.
+    """
     companions = _companions(problem, found, solved)
-    named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companions]
+    uneven, waves = _uneven(problem, found)
+    named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companions and f.pick.label not in uneven]
     needed = _needed(problem, solved, named)
     mean = {i: replace(_named(problem, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
     scatter = [_of_scatter(f) for f in loud if not is_unnamed(f.name)]
-    left = residues([*mean.values(), *scatter], frozenset(e.label for e in scatter))
+    names = [*mean.values(), *scatter]
+    small = {e.label: e.evidence for e in names if e.evidence < REST_SHARE * rest}
+    left = {
+        label: f"{nats:.0f} nats, where {rest:.0f} have no explanation: it may be only a part of these" for label, nats in small.items()
+    }
+    left = {**residues(names, frozenset(e.label for e in scatter)), **left}
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
-    unnamed = structures(problem.case, found, loud)
+    unnamed = tuple(sorted((*structures(problem.case, found, loud), *waves), key=lambda s: (-s.evidence, s.label)))
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
@@ -277,6 +297,38 @@ def _judge(
         rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
     return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
+
+
+def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[frozenset[str], tuple[Structure, ...]]:
+    """Find waves that take two close pitches to fit: their period is not constant. Return the labels, and the waves without a name."""
+    labels, waves = set[str](), []
+    for i, j in permutations(range(len(found)), 2):
+        second, first = found[i].pick, found[j].pick
+        if first.effect.name not in second.effect.beside or second.key != first.key or "pitch_mm" not in second.values:
+            continue
+        pitch = [p.values["pitch_mm"] for p in (first, second)]
+        if abs(pitch[0] / pitch[1] - 1.0) < 2.0 * APART:
+            labels |= {first.label, second.label}
+            location = localize_signal(
+                problem.paths, tuple(np.abs(p).sum(axis=1) for p in first.effect.signal(problem.paths, first.key, first.values))
+            )
+            location = Localization(
+                location.tests,
+                (first.key,),
+                runs=location.runs,
+                period_mm=float(np.mean(pitch)),
+                depends_on=("position",),
+                shape="its period is not constant",
+            )
+            waves.append(
+                Structure(
+                    f"{PREFIX}wave:E{first.key * 2}",
+                    "wave along the axis whose period is not constant",
+                    found[i].score / 2.0 + found[j].score / 2.0,
+                    location,
+                )
+            )
+    return frozenset(labels), tuple(waves)
 
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
@@ -339,6 +391,8 @@ def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: i
     pick, c, cov = solved.picks[i], solved.coefficients[i], solved.covariance[i]
     strength, u = strength_of(problem, pick, c, cov)
     shape = shape_of(pick, solved.shape_u[i])
+    if "t0_s" in shape:
+        shape |= {"t0_s": (shape["t0_s"][0], u_moment(problem, solved.picks, i))}
     location = localize_signal(problem.paths, tuple(problem.by_run(pick.raw(problem) @ c)))
     return NamedEffect(
         pick.effect.name, pick.key, strength, u, shape, c, cov, 0.5 * found.score,

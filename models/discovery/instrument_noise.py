@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from math import comb
 
 import numpy as np
 import scipy
@@ -15,6 +16,12 @@ SHARE, MEMORY = 0.1, 0.75
 (long-run variance 1.6 times that of one reading)."""
 CLEARLY = 0.85
 """The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
+FINE, QUIET, SHORTEST = 4, 0.25, 24
+"""Order of the differences of neighbours that tell the noise whatever the model misses (a wave of eight readings adds 0.5 %); share of an
+instrument's runs that may be quieter than its noise, because effects reach the other runs; and readings that a run must have."""
+LOW = 1.2
+"""Relative error of the noise of one run of n readings over 1/sqrt(n), at the share `QUIET` of noise alone: 0.67 times 1.17 (of a median)
+times 1.5 (differences share readings)."""
 LONE = 7.0
 """A reading farther from its neighbours than this many standard deviations does not count."""
 
@@ -85,6 +92,25 @@ def level(
         sd = smooth if smooth < CLEARLY * sd else sd
         out[kind] = Colour(max(sd, resolution_mm[kind] / np.sqrt(12.0)))
     return out
+
+
+def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1) -> dict[str, Colour]:
+    """Estimate the noise of each instrument from differences of neighbours alone, which hold hardly any effect; arguments as in `level`.
+
+    An effect that is sharp or dense in one run is not in all others, so the noise is that of the instrument's quiet runs (`QUIET`).
+    Instruments without runs of `SHORTEST` readings are left out.
+    """
+    found: dict[str, list[float]] = {}
+    start = 0
+    for n, kind in zip(lengths, kinds, strict=True):
+        part = slice(start, start + n)
+        start += n
+        keep = use[part] > 0
+        if keep.sum() >= SHORTEST:
+            scaled = (residual[part] / np.sqrt(np.maximum(1.0 - leverage[part], 0.1)))[keep]
+            low = 1.0 - LOW / np.sqrt(keep.sum())
+            found.setdefault(kind, []).append(robust_sd(np.diff(scaled, FINE)) / float(low * np.sqrt(comb(2 * FINE, FINE))))
+    return {kind: Colour(float(np.quantile(sds, QUIET))) for kind, sds in found.items()}
 
 
 def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str]) -> F1:

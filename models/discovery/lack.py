@@ -9,13 +9,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Agreement, Localization
+from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.instrument_noise import CLEARLY
+from abbe.models.discovery.instrument_noise import CLEARLY, fine
 from abbe.models.discovery.localization import locate
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.machine import AXES
@@ -27,6 +29,8 @@ CHANCE = 1e-3
 """Significance level of statements about one run, position or direction, family-wise for a campaign."""
 FEWEST, REPEATS = 8, 20
 """Minimum number of readings for judging a single run, and of repeats for estimating noise."""
+SHARED = 6
+"""Readings for one degree of freedom of the noise from neighbours' differences, which share readings and whose median is taken."""
 NEAR_MM = 0.05
 """Positions closer than this are repeats of one position."""
 ALONG_ONE_AXIS = 0.999
@@ -45,23 +49,33 @@ class Floor:
 
 
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
-    """Noise of each instrument: from repeats if these give clearly less than the fit's residuals, which may contain missing effects."""
+    """Noise of each instrument: of repeats, or of neighbours' differences, if clearly less than the fit leaves (what it misses is in that).
+
+    No effect, named or not, enters these two, so neither does the share of a gap that they judge.
+    """
+    left = problem.projection.residual * problem.sd_mm()
+    near = fine(left, problem.lengths, problem.kinds, problem.use, problem.projection.leverage)
     out = {}
     for kind, colour in problem.colours.items():
+        least = problem.case.resolution_mm[kind] / np.sqrt(12.0)
         steps = repeat_steps(problem.case, kind)
-        sd = max(float(np.sqrt(np.mean(steps**2) / 2.0)), problem.case.resolution_mm[kind] / np.sqrt(12.0)) if steps.size else np.inf
-        chance = 1.0 - f_above((sd / colour.sd_mm) ** 2, steps.size, KNOWN_FREEDOM) if steps.size >= REPEATS else 1.0
+        count = sum(int(np.count_nonzero(u)) for u, k in zip(problem.by_run(problem.use), problem.kinds, strict=True) if k == kind)
+        found = [(float(np.sqrt(np.mean(steps**2) / 2.0)), steps.size)] if steps.size >= REPEATS else []
+        found += [(near[kind].sd_mm, count // SHARED)] if kind in near and count // SHARED >= REPEATS else []
+        sd, freedom = min(((max(sd, least), n) for sd, n in found), default=(np.inf, 1))
+        chance = 1.0 - f_above((sd / colour.sd_mm) ** 2, freedom, KNOWN_FREEDOM)
         believed = sd < CLEARLY * colour.sd_mm and chance < CHANCE
-        out[kind] = Floor(sd, steps.size) if believed else Floor(colour.sd_mm, KNOWN_FREEDOM)
+        out[kind] = Floor(sd, freedom) if believed else Floor(colour.sd_mm, KNOWN_FREEDOM)
     return out
 
 
 def repeat_steps(case: Case, kind: str) -> F1:
-    """Return the differences, mm, of successive dwell readings of a run at the same position, approached from the same side.
+    """Return the differences, mm, of successive dwell readings at the same position of a set-up, approached from the same side.
 
-    Slow drift contributes little to them; errors of position, direction and set-up contribute nothing.
+    Slow drift contributes little to them; errors of position, direction and set-up contribute nothing. Each run of a laser has its own
+    zero, so of the differences between two runs their mean is taken out.
     """
-    visits: dict[object, list[tuple[float, float]]] = {}
+    visits: dict[object, list[tuple[float, float, str]]] = {}
     for run in case.runs:
         p = run.path
         if p.kind != kind or run.deviation_mm is None or p.at.v_mm_s.any():
@@ -69,9 +83,19 @@ def repeat_steps(case: Case, kind: str) -> F1:
         places = np.round(p.at.q_mm / NEAR_MM).astype(int).tolist()
         for place, sign, t, y, good in zip(places, p.at.sign.tolist(), p.at.t_s, run.deviation_mm, run.valid, strict=True):
             if good:
-                visits.setdefault((p.label, *place, *sign), []).append((float(t), float(y)))
-    steps = [np.diff([y for _, y in sorted(v)]) for v in visits.values()]
-    return np.concatenate(steps) if steps else np.zeros(0)
+                visits.setdefault((p.setup, *place, *sign), []).append((float(t), float(y), p.label))
+    steps: dict[tuple[str, str], list[float]] = {}
+    for visit in visits.values():
+        for (_, y, before), (_, later, after) in pairwise(sorted(visit)):
+            steps.setdefault((before, after), []).append(later - y)
+    out = [np.array(d) if before == after else _about_mean(np.array(d)) for (before, after), d in steps.items()]
+    return np.concatenate(out) if out else np.zeros(0)
+
+
+def _about_mean(differences: F1) -> F1:
+    """Take out the mean of the differences between two runs; the rest is enlarged by the degree of freedom that this costs."""
+    n = differences.size
+    return np.asarray((differences - differences.mean())[: n if n > 1 else 0] * np.sqrt(n / max(n - 1, 1)))
 
 
 def lack_of_fit(
@@ -103,6 +127,22 @@ def lack_of_fit(
         return location
     depends = tuple(dict.fromkeys(("position", *(("direction",) if shaped.directions else ()), *location.depends_on)))
     return replace(shaped, tests=location.tests, runs=location.runs, depends_on=depends, table=location.table)
+
+
+def unexplained(problem: WhitenedProblem, picks: Sequence[Pick], floor: Mapping[str, Floor], calm: F1) -> float:
+    """Return what picks and simulation leave above the noise ``floor``, in nats of the search; 0 within `TIMES` of it.
+
+    ``calm``: weight of each reading, shape (n,), 0 where a known effect makes the readings scatter.
+    """
+    projection = problem.projection
+    for pick in picks:
+        raw = pick.raw(problem)
+        projection = projection.without(problem.white(raw), pick.prior_sd(problem, raw.shape[1]))
+    count = (problem.use * calm > 0).astype(np.float64)
+    quieter = np.repeat([floor[k].sd_mm for k in problem.kinds], problem.lengths) / problem.sd_mm()
+    noise = float(count @ ((1.0 - projection.leverage) * quieter**2))
+    energy = float(count @ projection.residual**2)
+    return 0.5 * (energy - noise) if energy > TIMES**2 * noise else 0.0
 
 
 def _times(rest: F1) -> float:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import scipy
@@ -18,7 +18,8 @@ from abbe.models.arrays import F2
 from abbe.models.discovery.candidate_bank import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of, with_values
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
 from abbe.models.discovery.whitened_problem import WhitenedProblem
-from abbe.models.effects.effect import Effect, Parameter
+from abbe.models.effects.effect import Effect, Parameter, Signal
+from abbe.models.effects.path import Path
 
 SWEEPS = 2
 EVALUATIONS = 9
@@ -41,6 +42,10 @@ UNNAMED_LABELS = 40
 """Number of labels of structures without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """Price of a freedom of form of a chosen effect: this share of the price of its columns, plus a constant."""
+APART = 0.06
+"""Least relative distance of a second effect's parameter from that of the first, and from the harmonics of this."""
+UNSURE = 3.84
+"""Chi-square below the best up to which a moment is not excluded (95 %)."""
 EXCLUDED = 12.0
 """A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8
@@ -123,43 +128,56 @@ def form_price(logs: float) -> float:
 
 @dataclass(frozen=True)
 class Contest:
-    """The search over one problem: banks of candidates, ``logs`` of `price` by label (``widths``), number of labels and of readings."""
+    """The search over one problem: banks of candidates, ``logs`` of `price` by label (``widths``), number of labels and of readings.
+
+    ``seconds``: effects that are tried only beside another one (`abbe.models.effects.effect.Effect.beside`).
+    """
 
     problem: WhitenedProblem
     banks: list[Bank]
     widths: dict[str, float]
     labels: int
     readings: int
+    seconds: tuple[Effect, ...] = ()
 
     @classmethod
     def of(cls, problem: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
         """Set up a search over all starts of all mean effects that the present simulation does not contain."""
-        bank = bank_of(problem, starts_of(competing(effects, problem.case.includes)))
+        rivals = competing(effects, problem.case.includes)
+        bank = bank_of(problem, starts_of([e for e in rivals if not e.beside]))
         widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}
-        return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(problem.use.sum()))
+        seconds = tuple(e for e in rivals if e.beside)
+        return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(np.count_nonzero(problem.use)), seconds)
 
-    def look_for_unnamed(self, rows: F2) -> None:
-        """Add structures without a name to the search, with starts at the peaks of the residuals after projection by ``rows``."""
+    def look_for_more(self, picks: Sequence[Pick], rows: F2) -> None:
+        """Add to the search what is only tried beside ``picks``, and structures without a name.
+
+        The latter start at the peaks of the residuals after projection by ``rows``, which project out the picks.
+        """
         problem = self.problem
         left = problem.projection.residual - rows.T @ (rows @ problem.projection.y)
         labels = [p.label for p in problem.paths]
         sigma = {kind: c.sd_mm for kind, c in problem.colours.items()}
         rivals = generic_rivals(problem.case, dict(zip(labels, problem.by_run(left), strict=True)), sigma)
-        bank = bank_of(problem, starts_of(competing(rivals, problem.case.includes)))
+        seconds = [_second(e, p, self.problem.paths) for e in self.seconds for p in picks if p.effect.name in e.beside]
+        bank = bank_of(problem, starts_of([*competing(rivals, problem.case.includes), *seconds]))
         self.widths.update({p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)})
         self.banks[1:] = [bank]
 
     def price(self, pick: Pick) -> float:
         """Price of a pick in this search, its forms included."""
-        plain = price(pick, self.widths[pick.label], self.readings, self.labels)
+        plain = price(pick, self._width(pick.label, pick.effect.signal, pick), self.readings, self.labels)
         return plain + sum(form_price(self._form_width(pick, i)) for i in range(len(pick.forms)))
 
     def _form_width(self, pick: Pick, i: int) -> float:
-        key = f"{pick.label}/{pick.forms[i].name}"
-        if key not in self.widths:
-            columns = np.abs(self.problem.raw(pick.forms[i].signal, pick.key, pick.values))
-            self.widths[key] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
-        return self.widths[key]
+        return self._width(f"{pick.label}/{pick.forms[i].name}", pick.forms[i].signal, pick)
+
+    def _width(self, name: str, signal: Signal, pick: Pick) -> float:
+        """Return ``logs`` of `price` for the signal of a pick or of one of its forms."""
+        if name not in self.widths:
+            columns = np.abs(self.problem.raw(signal, pick.key, pick.values))
+            self.widths[name] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
+        return self.widths[name]
 
     def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Selection]:
         """Return the best candidate of each label on the grid, best labels first; labels in ``without`` are left out."""
@@ -206,13 +224,37 @@ class Contest:
         return best
 
 
+def _second(effect: Effect, pick: Pick, paths: Sequence[Path]) -> Effect:
+    """Return an effect tried beside ``pick``, with its key, and with starts for these runs.
+
+    A moment starts between runs and within them (`moments`); a value that the pick has too, not near its value or harmonics.
+    """
+    shape = []
+    for q in effect.shape:
+        starts = q.starts
+        if q.name == "t0_s":
+            starts = moments(paths)
+        elif q.name in pick.values:
+            times = np.array([pick.values[q.name] / s for s in starts])
+            apart = np.abs(times - np.maximum(np.round(times), 1.0)) > APART * np.maximum(times, 1.0)
+            starts = tuple(s for s, far in zip(starts, apart, strict=True) if far)
+        shape.append(replace(q, starts=starts))
+    return replace(effect, keys=(pick.key,), shape=tuple(shape))
+
+
+def moments(paths: Sequence[Path]) -> tuple[float, ...]:
+    """Return times, s, at which something may begin: half way between successive runs, and in the middle of each but the first."""
+    ends = sorted((float(p.at.t_s[0]), float(p.at.t_s[-1])) for p in paths)
+    return tuple(t for (_, end), (start, last) in pairwise(ends) for t in (0.5 * (end + start), 0.5 * (start + last)))
+
+
 def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Selection]:
     """Select all effects that are worth their price, with backward steps after every addition."""
     picks, problem = list(start), contest.problem
     for _ in range(3 * most):
         rows = rows_for(problem, picks)
         form = contest.next_form(picks, rows)
-        contest.look_for_unnamed(rows)
+        contest.look_for_more(picks, rows)
         new = contest.next(picks, rows) if len(picks) < most else None
         if form is not None and (new is None or form[2] > new.score or form[2] > 0.5 * new.score):
             picks[form[0]] = form[1]
@@ -279,6 +321,19 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
         gain = gain_of(contest.problem, pick, others(contest.problem, picks, i))
         out.append(Selection(pick, gain, gain - contest.price(pick)))
     return out
+
+
+def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
+    """Standard uncertainty, s, of the moment at which pick ``i`` begins: a quarter of the times that explain nearly as much (`UNSURE`).
+
+    A step in time has no derivative, so the fit tells no uncertainty.
+    """
+    rows, pick = others(problem, picks, i), picks[i]
+    times = np.array([*moments(problem.paths), pick.values["t0_s"]])
+    gains = np.array([gain_of(problem, with_values(pick, {**pick.values, "t0_s": float(t)}), rows) for t in times])
+    near = times[gains > gains.max() - UNSURE]
+    gap = np.diff(np.sort(times))[max(int(np.searchsorted(np.sort(times), pick.values["t0_s"])) - 1, 0)]
+    return float(max(0.25 * np.ptp(near), gap / np.sqrt(12.0)))
 
 
 @dataclass(frozen=True)

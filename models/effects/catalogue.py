@@ -29,9 +29,11 @@ from abbe.models.effects.thermal import axis_thermal_growth, spindle_thermal_dri
 
 CATALOGUE: tuple[Effect, ...] = (
     backlash.EFFECT,
+    backlash.BEGUN,
     backlash_position_dependent.EFFECT,
     reversal_spike.EFFECT,
     cyclic_error.EFFECT,
+    cyclic_error.SECOND,
     servo_mismatch.EFFECT,
     contour_lag.EFFECT,
     stick_slip.EFFECT,

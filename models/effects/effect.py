@@ -90,6 +90,8 @@ class Effect:
         Tests that cannot show it.
     variant_of : str
         Name of a simpler effect which this one contains. It replaces the simpler one only on clear evidence.
+    beside : tuple of str
+        Names of the effects beside which alone this one is tried, at the same key.
     separated_by : dict
         From a rival (name, or name:key) to the tests that tell the two apart (``next_test.adds``).
     """
@@ -115,6 +117,7 @@ class Effect:
     absorbed_by: tuple[str, ...] = ()
     blind: tuple[str, ...] = ()
     variant_of: str = ""
+    beside: tuple[str, ...] = ()
     separated_by: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
 
     def label(self, key: str) -> str:

@@ -42,6 +42,8 @@ DRIVES = ("stick_slip", "vibration")
 OVERSHADOWS = 3.0
 """Vibration or stick-slip of one axis shows a little along the others, so a finding whose evidence is weaker by this factor counts as
 explained. A second vibration of less than about 0.6 of the first's size is therefore not named."""
+GATE = 1.3
+"""Readings below this multiple of the stick-slip speed scatter."""
 SAW_P = 0.05
 CREEP_MM_S = 4.5
 
@@ -248,6 +250,12 @@ def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[f
         size, u = rough.size_mm * UM, rough.u_mm * UM
         out.append(VarianceFinding("stick_slip", AXES[axis], size, u, {"v_c": rough.v_c}, float(evidence), location))
     return out
+
+
+def creeping(paths: tuple[Path, ...], found: VarianceFinding) -> F1:
+    """Return 1 for ball-bar readings that a stick-slip makes scatter (`GATE`), else 0, stacked over the runs, shape (n,)."""
+    axis, fast_mm_s = AXES.index(found.key), GATE * found.parameters["v_c"]
+    return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < fast_mm_s) * float(p.kind == "bar") for p in paths])
 
 
 def _burst(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:

@@ -2,11 +2,25 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from abbe.models.arrays import F3
-from abbe.models.effects.columns import AXIS_KEYS, UM, along, axis_of, before_first_turn, first, of_machine, play, turn_between, wind_up
-from abbe.models.effects.effect import Effect, Form, Values
+from abbe.models.effects.columns import (
+    AXIS_KEYS,
+    CAMPAIGN_S,
+    UM,
+    along,
+    axis_of,
+    before_first_turn,
+    first,
+    of_machine,
+    play,
+    turn_between,
+    wind_up,
+)
+from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Places
 
 WIND_UP_MM = (0.05, 0.15, 0.5, 2.0)
@@ -37,6 +51,10 @@ def _run_in(at: Places, key: str, values: Values) -> F3:
     """Return the wind-up left from a reversal just before the first reading."""
     a = axis_of(key)
     return along(a, -0.5 * UM * at.sign[:, a] * np.exp(-before_first_turn(at, a) / WIND_UP_MM[2]))
+
+
+def _begun(at: Places, key: str, values: Values) -> F3:
+    return lost_motion(at, key, values) * (at.t_s >= values["t0_s"])[:, None, None]
 
 
 EFFECT = Effect(
@@ -71,3 +89,18 @@ EFFECT = Effect(
         "straightness": ("opposite_direction",),
     },
 )
+BEGUN = replace(
+    EFFECT,
+    name="backlash_begun",
+    title="backlash (lost motion) that begins during the campaign",
+    shape=(Parameter("t0_s", "s", 0.0, 10.0 * CAMPAIGN_S[1], CAMPAIGN_S[0], "clock of the campaign", CAMPAIGN_S),),
+    signal=of_machine(_begun),
+    forms=(),
+    needs="the same reversals before and after it begins",
+    signature="the steps of a lost motion are missing in the first runs",
+    remedy="mechanics",
+    remedy_text="find what came loose: coupling, nut, thrust bearing or clamp; do not enter it as backlash compensation before",
+    variant_of="backlash",
+    beside=("backlash", "backlash_position_dependent", "servo_mismatch", "reversal_spike"),
+)
+"""A lost motion that was not there from the beginning; one that grows in a step is this one beside `EFFECT`."""

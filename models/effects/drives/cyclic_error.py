@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from abbe.models.arrays import F1, F3
 from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_path, of_places, share_of_stroke
-from abbe.models.effects.effect import Effect, Form, Parameter, Values
+from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
 from abbe.models.effects.path import Path, Places
 
 LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
@@ -28,6 +30,11 @@ def wave(at: Places, key: str, values: Values) -> F3:
 
 def _second(at: Places, key: str, values: Values) -> F3:
     return along(axis_of(key), *_waves(at, key, values, 2))
+
+
+def _harmonics(first: int, last: int) -> Signal:
+    """Return the signal of some higher harmonics, which a saw-tooth has."""
+    return of_places(lambda at, key, values: along(axis_of(key), *(w for k in range(first, last + 1) for w in _waves(at, key, values, k))))
 
 
 def _along(path: Path, at: Places, key: str) -> F1:
@@ -60,6 +67,8 @@ EFFECT = Effect(
     strength=amplitude,
     forms=(
         Form("second harmonic", of_places(_second)),
+        Form("harmonics 3 to 6", _harmonics(3, 6)),
+        Form("harmonics 7 to 14", _harmonics(7, 14)),
         Form("modulated", of_path(_modulated)),
         Form("modulated twice", of_path(_modulated_twice)),
     ),
@@ -74,3 +83,12 @@ EFFECT = Effect(
         "cyclic_error": ("single_axis_laser",),
     },
 )
+SECOND = replace(
+    EFFECT,
+    name="cyclic_error_second",
+    title="second cyclic error of screw or encoder",
+    signature="a second chirp, of another pitch, on the circle of the same axis",
+    beside=("cyclic_error",),
+    variant_of="cyclic_error",
+)
+"""A second pitch of the same axis, such as that of an encoder beside that of its screw."""

@@ -54,7 +54,7 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
     if unnamed:
-        contest.look_for_unnamed(np.zeros((0, problem.gap.size)))
+        contest.look_for_more((), np.zeros((0, problem.gap.size)))
     labels: list[str] = []
     sizes: list[int] = []
     parts = []
