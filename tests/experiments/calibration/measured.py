@@ -8,18 +8,16 @@ used: without mean and slope, of unit size, turned about or upside down at rando
 import csv
 import gzip
 import json
-import zipfile
 from functools import cache
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
+from python_calamine import CalamineWorkbook
 
 from tests.experiments.calibration.curves import Rng
 from tests.experiments.calibration.kinematics import Curve, F
 
 SHARED = Path(__file__).resolve().parents[4] / "shared" / "data" / "foreign"
-CELL = "{http://schemas.openxmlformats.org/spreadsheetml/2006/main}"
 
 
 def foreign(rng: Rng, length_mm: float, size: float) -> Curve:
@@ -60,15 +58,10 @@ def _slits() -> list[F]:
 
 def _lathe() -> list[F]:
     """Temperature of the spindle's front, the last column of every day's sheet."""
-    out = []
-    with zipfile.ZipFile(SHARED / "thermal-lathe" / "ACE_X.xlsx") as book:
-        for name in sorted(n for n in book.namelist() if n.startswith("xl/worksheets/sheet")):
-            rows = ElementTree.fromstring(book.read(name)).iter(f"{CELL}row")
-            cells = [[c.findtext(f"{CELL}v") for c in row] for row in rows][1:]
-            y = np.array([float(row[-1]) for row in cells if row and row[-1]])
-            if len(y) > 40 and y.std() > 0.0:
-                out.append(y)
-    return out
+    book = CalamineWorkbook.from_path(SHARED / "thermal-lathe" / "ACE_X.xlsx")
+    return [
+        np.array([row[-1] for row in book.get_sheet_by_name(name).to_python()[1:] if row[-1] != ""]) for name in sorted(book.sheet_names)
+    ]
 
 
 def _roundness() -> list[F]:
