@@ -236,6 +236,19 @@ class Calibration(Section):
     laser: Certificate = Field(default=None, description="of the laser")
 
 
+class IssuerSection(Section):
+    """Who issues digital calibration certificates (`abbe report --out FILE.xml`)."""
+
+    laboratory: str = Field(min_length=1, max_length=200)
+    city: str = Field(min_length=1, max_length=200)
+    country: str = Field(pattern="^[A-Z]{2}$", description="ISO 3166-1, two letters")
+    person: str = Field(min_length=1, max_length=200, description="who is responsible")
+    customer: str = Field(default="", max_length=200, description="of the machine; empty: the laboratory itself")
+    place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
+        default="customer", description="where machines are measured, as seen from the laboratory"
+    )
+
+
 class Nc(Section):
     """The controller that NC programs are written for (`abbe measure --nc`)."""
 
@@ -414,6 +427,7 @@ class MachineFile(Section):
     limits: Limits = Limits()
     material: Material = Material()
     calibration: Calibration = Calibration()
+    issuer: IssuerSection | None = None
     nc: Nc = Nc()
     verify: Verify = Verify()
     mqtt: Mqtt = Mqtt()

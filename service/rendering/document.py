@@ -51,6 +51,18 @@ class Instrument:
 
 
 @dataclass(frozen=True, slots=True)
+class Issuer:
+    """Who issues a digital certificate. ``country``: ISO 3166-1, two letters; ``customer``: empty: itself; ``place``: of measuring."""
+
+    laboratory: str
+    city: str
+    country: str
+    person: str
+    customer: str = ""
+    place: str = "customer"
+
+
+@dataclass(frozen=True, slots=True)
 class Lines:
     """A list of sentences; ``numbered``: an ordered list."""
 
@@ -107,7 +119,8 @@ class Document:
 
     ``verdict``: sign, word and sentence; ``remarks``: important notes at the top; ``sections``: main results, printed before the figures;
     ``not_observable``: what this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
-    figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper.
+    figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper; ``days``: first and last day
+    of the measurement (ISO 8601), None if not on record; ``issuer``: of a digital certificate.
     """
 
     kind: Kind
@@ -125,6 +138,8 @@ class Document:
     provenance: Mapping[str, str] = field(default_factory=dict)
     signatures: Sequence[str] = SIGNATURES
     lang: str = "en"
+    days: tuple[str, str] | None = None
+    issuer: Issuer | None = None
 
     @property
     def pictures(self) -> list[Picture]:

@@ -1,4 +1,4 @@
-"""A report as HTML page, PDF, CSV or JSON file. Page and PDF print the same text (`document_data.shown`) and the same pictures."""
+"""A report as HTML page, PDF, CSV, JSON, DCC or AQDEF. Page and PDF print the same text (`document_data.shown`) and the same pictures."""
 
 from __future__ import annotations
 
@@ -14,6 +14,8 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from abbe.service.errors import FileFormatError
+from abbe.service.rendering.aqdef import document_dfq
+from abbe.service.rendering.certificate import document_dcc
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_data import document_csv, document_json, shown
 from abbe.service.rendering.numbers import printable
@@ -64,6 +66,8 @@ FORMS: dict[str, Callable[[Document], str | bytes]] = {
     ".html": document_html,
     ".csv": document_csv,
     ".json": document_json,
+    ".xml": document_dcc,
+    ".dfq": document_dfq,
 }
 """Writer of each file extension."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from datetime import date
 from pathlib import Path
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
@@ -10,7 +11,7 @@ from abbe.service.config_schema import MachineFile
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError
-from abbe.service.rendering.document import Document
+from abbe.service.rendering.document import Document, Issuer
 from abbe.service.report.later_changes import with_later_changes
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_done import push_report, verification_report
@@ -30,6 +31,13 @@ def rules_of(config: MachineFile | None) -> Rules:
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     days = {"ballbar": config.calibration.ballbar, "laser": config.calibration.laser}
     return Rules(limits, {k: v for k, v in days.items() if v is not None}, config.limits.temperature_c, config.material.by_axis())
+
+
+def certified(document: Document, config: MachineFile | None, measured_on: date | None) -> Document:
+    """The report with the issuer of a digital certificate from a machine file and, where it has none, the day of the measurement."""
+    days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
+    issuer = None if config is None or config.issuer is None else Issuer(**config.issuer.model_dump())
+    return replace(document, issuer=issuer, days=days)
 
 
 def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:
@@ -98,15 +106,17 @@ def folder_report(folder: Path, rules: Rules) -> Document:
 def _measured(store: Store, name: str) -> Measured:
     record = store.campaigns.find(name)
     runs = store.runs.all(record.id)
-    facts = {"Created": record.created_utc}
-    if runs:
-        ends = [r.ended_utc for r in runs if r.ended_utc]
-        facts |= {"First run started": min(r.started_utc for r in runs)} | ({"Last run ended": max(ends)} if ends else {})
+    imported = "imported" in record.doc  # its runs bear the time of the import
+    facts, days = {"Imported" if imported else "Created": record.created_utc}, None
+    if runs and not imported:
+        begun, ends = min(r.started_utc for r in runs), [r.ended_utc for r in runs if r.ended_utc]
+        facts |= {"First run started": begun} | ({"Last run ended": max(ends)} if ends else {})
+        days = (begun[:10], max([begun, *ends])[:10])
     solved = next((s for s in reversed(store.solutions.all(record.id)) if "mean_over_volume" in s.doc), None)
     solution = None if solved is None else SolutionResult(stored_solution(solved.doc, solved.id), solved.id)
     campaign = from_store(store, name)
     table = table_remarks(store, campaign.site.name, campaign.runs)
-    return Measured(campaign, facts, [_state(r) for r in runs], solution, table)
+    return Measured(campaign, facts, [_state(r) for r in runs], solution, table, days)
 
 
 def _state(run: RunRecord) -> tuple[str, ...]:

@@ -56,7 +56,7 @@ class Measured:
     """Content of a report of a measurement.
 
     ``facts``: further lines for the head; ``states``: run, test, role, state and reason of every run, also of incomplete ones;
-    ``solution``: the new one or the latest stored one; ``table``: remarks about the tables in force.
+    ``solution``: the new one or the latest stored one; ``table``: remarks about the tables in force; ``days``: as in `Document`.
     """
 
     campaign: Campaign
@@ -64,6 +64,7 @@ class Measured:
     states: Sequence[Sequence[str]] = ()
     solution: SolutionResult | None = None
     table: TableRemarks = NO_TABLE_REMARKS
+    days: tuple[str, str] | None = None
 
 
 def campaign_report(found: Measured, rules: Rules) -> Document:
@@ -94,6 +95,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
             *_budget(found.solution),
             Section("Runs", [_run_table(found)]),
         ],
+        days=found.days,
     )
 
 

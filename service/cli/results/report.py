@@ -1,4 +1,4 @@
-"""``abbe report``: a report for signature, as PDF, HTML, CSV or JSON."""
+"""``abbe report``: a report for signature, as PDF, HTML, CSV or JSON, or as DCC or AQDEF for other programs."""
 
 from __future__ import annotations
 
@@ -21,11 +21,16 @@ from abbe.service.cli.common import (
 )
 
 if TYPE_CHECKING:
+    from datetime import date
+
     from abbe.service.rendering.document import Document
     from abbe.service.report.report_parts import Rules
 
 
-def report(
+OUT_HELP = "FILE.pdf, .html, .csv, .json, .xml (DCC) or .dfq (AQDEF); may be repeated. Default: a PDF here."
+
+
+def report(  # noqa: PLR0913 - one argument for each option
     what: Annotated[
         str,
         typer.Argument(
@@ -38,12 +43,14 @@ def report(
     ] = None,
     out: Annotated[
         list[Path] | None,
-        typer.Option(
-            "--out", metavar="FILE", help="FILE.pdf, .html, .csv or .json; may be repeated. Default: a PDF here.", show_default=False
-        ),
+        typer.Option("--out", metavar="FILE", help=OUT_HELP, show_default=False),
     ] = None,
     of: Annotated[
         str | None, typer.Option("--of", metavar="MACHINE", help="Machine of the push, if the database holds several.", show_default=False)
+    ] = None,
+    measured_on: Annotated[
+        str | None,
+        typer.Option("--measured-on", metavar="DATE", help="Day of the measurement, for a DCC of imported runs.", show_default=False),
     ] = None,
     db: DbOption = None,
     machine: MachineOption = None,
@@ -52,22 +59,24 @@ def report(
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
     The machine file gives database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2 is reduced to
-    20 °C. Nothing is measured or computed again; the same data give the same bytes.
+    20 °C. Nothing is measured or computed again; the same data give the same bytes. A digital calibration certificate (.xml) needs
+    [issuer] in the machine file and is not signed.
     """
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
-    from abbe.service.report.report import NUMBERED, rules_of
+    from abbe.service.report.report import NUMBERED, certified, rules_of
     from abbe.service.verification.reduction import AT_20
 
     for target in out or []:
         form_of(target)  # refuse a wrong suffix before the work
     # A folder and another database may be of another machine: its file has to be named.
     file = machine if db is not None or is_folder(what) else named_machine(machine)
-    rules = rules_of(None if file is None else load_machine(file).machine)
+    config = None if file is None else load_machine(file).machine
+    rules = rules_of(config)
     # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
-    document = _document(what, number, of, url, rules)
+    document = certified(_document(what, number, of, url, rules), config, _day(measured_on))
     targets = out or [Path(default_name(document))]
     for target in targets:
         write_document(document, target)
@@ -82,6 +91,17 @@ def report(
         db=None if what in NUMBERED else db,
         as_json=as_json,
     )
+
+
+def _day(text: str | None) -> date | None:
+    from datetime import date
+
+    from abbe.service.errors import ConfigError
+
+    try:
+        return None if text is None else date.fromisoformat(text)
+    except ValueError:
+        raise ConfigError(f"--measured-on is {text!r}, no day", "give it as 2026-11-26") from None
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:

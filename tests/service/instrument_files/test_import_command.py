@@ -7,6 +7,7 @@ import os
 import pty
 import subprocess
 import sys
+import xml.etree.ElementTree as ET
 from pathlib import Path
 from typing import Any
 
@@ -164,6 +165,21 @@ def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:
     assert "t.csv: what are the columns? - give --columns FILE" in abbe.fails("import", "t.csv", "--yes")
     assert abbe("import", "t.csv", "--yes", "--columns", "c.toml").code == 0
     assert figures(report(abbe, "t"))["E"][0] == pytest.approx(14.0)
+
+
+def test_a_laser_file_becomes_a_certificate_and_a_file_for_statistics(abbe: Abbe) -> None:
+    issuer = '[issuer]\nlaboratory = "Plant 2"\ncity = "Bonn"\ncountry = "DE"\nperson = "A. B."\n'
+    Path("mill.toml").write_text(MACHINE_FILE + issuer)
+    abbe("import", "x.rtl", "--yes", "--machine", "mill.toml")
+    assert "when it was measured, which is not on record" in abbe.fails("report", "x", "--machine", "mill.toml", "--out", "x.xml")
+    assert "--measured-on is '22.11.2026', no day" in abbe.fails("report", "x", "--machine", "mill.toml", "--measured-on", "22.11.2026")
+    done = abbe("report", "x", "--machine", "mill.toml", "--measured-on", "2026-11-22", "--out", "x.xml", "--out", "x.dfq")
+    assert done.code == 0, done.err
+    root = ET.parse("x.xml").getroot()
+    assert root.findtext(".//{*}beginPerformanceDate") == "2026-11-22"
+    values = {(one.findtext(".//{*}content") or ""): one.findtext(".//{*}value") for one in root.iter("{https://ptb.de/dcc}quantity")}
+    assert float(values["E: systematic deviation, both directions"] or "nan") == pytest.approx(14.0)
+    assert "K2001/4 E" in Path("x.dfq").read_text(encoding="utf-8-sig")
 
 
 def test_a_person_is_asked_at_the_terminal(tmp_path: Path) -> None:
