@@ -175,5 +175,6 @@ def solve(
         The data of a run, bar or mirror contradict its description; the message names it and the remedy.
     """
     known = remove_effects(None, campaign, campaign_table(None, campaign))
-    found = assess(solve_runs(campaign.site, known.campaign.runs, model=model, progress=progress))
+    solved = solve_runs(campaign.site, known.campaign.runs, model=model, progress=progress)
+    found = assess(solved, unknown_table=bool(known.not_removed))
     return Solution(campaign, found, table_line(known.in_force) if known.in_force is not None else known.not_removed)

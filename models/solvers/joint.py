@@ -79,6 +79,8 @@ class JointSolution:
     order_choice : scores of all orders on held-out runs; None when the caller chose.
     size_factors : dict
         Ratio of estimated to documented typical size for each class of unknowns; ``length``: correlation length, strokes.
+    table_factor : array, shape (p, k), or None
+        Factor of that part of the covariance of ``estimate`` which an unknown table in force during the runs causes; None: there was none.
     """
 
     machine: Machine
@@ -101,6 +103,7 @@ class JointSolution:
     model: str
     order_choice: OrderChoice | None
     size_factors: dict[str, float]
+    table_factor: F2 | None = None
 
     @property
     def coefficients(self) -> F1:

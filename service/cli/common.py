@@ -101,19 +101,20 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
         The database cannot be opened.
     """
     from abbe.service.errors import StoreError
-    from abbe.service.storage.engine import parse_url
     from abbe.service.storage.store import Store
 
-    parsed = parse_url(url)
-    if (
-        must_exist
-        and parsed.drivername == "sqlite"
-        and parsed.database
-        and parsed.database != ":memory:"
-        and not Path(parsed.database).exists()
-    ):
-        raise StoreError(f"there is no database {parsed.database}", "give -m FILE or --db URL")
+    if must_exist and (missing := missing_file(url)):
+        raise StoreError(f"there is no database {missing}", "give -m FILE or --db URL")
     return Store.open(url)
+
+
+def missing_file(url: str) -> str:
+    """Return the file of a SQLite database that does not exist; empty for every other database."""
+    from abbe.service.storage.engine import parse_url
+
+    parsed = parse_url(url)
+    named = parsed.database if parsed.drivername == "sqlite" else None
+    return named if named and named != ":memory:" and not Path(named).exists() else ""
 
 
 @contextmanager

@@ -19,6 +19,8 @@ from abbe.service.identification.table_removal import CampaignTable, remove_tabl
 from abbe.service.runs.cases import case_of
 from abbe.service.storage.store import Store
 
+IN_U = "U includes what a table of usual size may have done"
+
 
 @dataclass(frozen=True)
 class RemovedEffects:
@@ -27,7 +29,7 @@ class RemovedEffects:
     ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
     used; ``version``: of the book, None without one; ``in_force``: the active table whose side effects were subtracted
     (`abbe.service.identification.table_removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
-    in the readings, empty otherwise.
+    in the readings, which the assessment of a solution has to be told, empty otherwise.
     """
 
     campaign: Campaign
@@ -63,7 +65,7 @@ def remove_effects(
         The book contains an effect that is not in the catalogue.
     """
     left = remove_table(campaign, table.table)
-    return replace(_without_book_effects(store, left, effects), in_force=left.removed, not_removed=table.why)
+    return replace(_without_book_effects(store, left, effects), in_force=left.removed, not_removed=table.why and f"{table.why}; {IN_U}")
 
 
 def _without_book_effects(store: Store | None, campaign: Campaign, effects: tuple[Effect, ...] | None) -> RemovedEffects:

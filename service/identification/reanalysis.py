@@ -116,7 +116,8 @@ def solve_task(task: ReanalysisTask) -> ReanalysisResult:
             measured = from_store(store, task.campaign)
             known = remove_effects(store, measured, campaign_table(store, measured))
         solved = solve_runs(known.campaign.site, known.campaign.runs, model=task.model)
-        doc = {"campaign": known.campaign.name, "machine": known.campaign.site.doc} | solution_doc(assess(solved)) | known.doc
+        found = assess(solved, unknown_table=bool(known.not_removed))
+        doc = {"campaign": known.campaign.name, "machine": known.campaign.site.doc} | solution_doc(found) | known.doc
         return ReanalysisResult(task.campaign, doc)
     except AbbeError as error:
         return ReanalysisResult(task.campaign, None, f"{error.code}: {error}")

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Literal, cast
 
 import numpy as np
@@ -49,6 +49,7 @@ from abbe.service.domain.solution_file import (
 )
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.stored_prediction import prediction_of
+from abbe.service.identification.unknown_table import with_unknown_table
 from abbe.service.tables.measured_with import distinct
 
 VERDICTS = ("mostly assumption", "usable with care", "good")
@@ -146,8 +147,13 @@ class Assessment:
         return predict_deviation(self.sources, points_mm, frame=volume_frame(self.joint.machine))
 
 
-def assess(solved: Solved) -> Assessment:
-    """Assess a solution: observability, uncertainty over the volume, budget."""
+def assess(solved: Solved, *, unknown_table: bool = False) -> Assessment:
+    """Assess a solution: observability, uncertainty over the volume, budget.
+
+    ``unknown_table``: a table acted during the runs and its effect is still in the readings; the uncertainty then includes it.
+    """
+    if unknown_table:
+        solved = replace(solved, joint=with_unknown_table(solved.joint))
     joint = solved.joint
     sources = error_sources(joint)
     prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))

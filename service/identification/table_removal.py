@@ -63,7 +63,7 @@ def campaign_table(store: Store | None, campaign: Campaign) -> CampaignTable:
     if image is None and store is not None:
         image = images_of(store)(crc)
     if image is None:
-        where = "this folder" if store is None else "this database"
+        where = " or ".join(["this folder"] * (campaign.folder is not None) + ["this database"] * (store is not None))
         sure = any(one.acting for one in acted)  # runs of older versions do not state whether a table acted
         return CampaignTable(None, f"measured with table {crc:08X}, which is not in {where}: {NOT_REMOVED}" if sure else "")
     try:

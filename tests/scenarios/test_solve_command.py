@@ -34,11 +34,11 @@ def assessed_once():
     """What a solution can tell takes longer than the solution; it is a function of machine, readings and model."""
     assess, known = solve_report.assess, {}
 
-    def look_up(solved):
-        values = (solved.joint.coefficients.tobytes(), repr(solved.removed), repr(solved.tables))
+    def look_up(solved, **words):
+        values = (solved.joint.coefficients.tobytes(), repr(solved.removed), repr(solved.tables), repr(words))
         key = (repr(solved.joint.machine), solve_report.model_key(solved.joint), *values, *sorted(solved.digests.items()))
         if key not in known:
-            known[key] = assess(solved)
+            known[key] = assess(solved, **words)
         return replace(known[key], solved=solved)
 
     with pytest.MonkeyPatch.context() as patch:

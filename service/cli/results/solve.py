@@ -17,6 +17,7 @@ from abbe.service.cli.common import (
     MachineOption,
     conclude,
     database_url,
+    missing_file,
     named_machine,
     open_store,
     print_json,
@@ -87,13 +88,12 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
 
-    A folder's result is stored only if --db or -m names a database. A run that contradicts its description is refused (exit code 2).
+    A folder's result is stored only if --db or -m names a database; tables that only this database holds then count, too. A run that
+    contradicts its description is refused (exit code 2).
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution
     from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.errors import ConfigError
-    from abbe.service.identification.effect_removal import remove_effects
-    from abbe.service.identification.table_removal import campaign_table
     from abbe.service.rendering.document_page import form_of
     from abbe.service.runs.points import read_points
 
@@ -106,20 +106,19 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
-        known = remove_effects(None, chosen, campaign_table(None, chosen))
-        summary, doc = _solved(known.campaign, wanted)
-        doc |= known.doc
-        if db is not None or machine is not None:
-            with open_store(database_url(db, machine), must_exist=False) as store:  # after the solution: a refusal creates no database
+        url = None if db is None and machine is None else database_url(db, machine)
+        with ExitStack() as stack:
+            known_store = None if url is None or missing_file(url) else stack.enter_context(open_store(url))
+            summary, doc = _solved(known_store, chosen, wanted)
+            if url is not None:  # a new database only after the solution: a refusal creates none
+                store = known_store or stack.enter_context(open_store(url, must_exist=False))
                 doc |= store_solution(store, found, doc)
         if report is not None:
             _write_report(None, chosen, summary, doc, machine, report)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
             chosen = found.without(without or [])
-            known = remove_effects(store, chosen, campaign_table(store, chosen))
-            summary, doc = _solved(known.campaign, wanted)
-            doc |= known.doc
+            summary, doc = _solved(store, chosen, wanted)
             doc |= store_solution(store, found, doc)
             if report is not None:
                 _write_report(store, chosen, summary, doc, machine if db is not None else named_machine(machine), report)
@@ -176,13 +175,17 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
         yield store, found
 
 
-def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
-    """Solve a campaign; return the assessment of the solution and its document. Progress goes to stderr."""
+def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
+    """Solve a campaign without its known effects; return the assessment of the solution and its document. Progress goes to stderr."""
     from abbe.service.cli.running import display
     from abbe.service.domain.progress import Progress
+    from abbe.service.identification.effect_removal import remove_effects
     from abbe.service.identification.solve import solve_runs
     from abbe.service.identification.solve_report import as_doc, assess, solution_of
+    from abbe.service.identification.table_removal import campaign_table
 
+    known = remove_effects(store, chosen, campaign_table(store, chosen))
+    campaign = known.campaign
     with display() as sink:
         stages = iter(range(1, STAGES))
 
@@ -191,9 +194,9 @@ def _solved(campaign: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict
 
         solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, progress=report_stage)
         report_stage("what these runs cannot tell, and how well the volume is known")
-        summary = assess(solved)
+        summary = assess(solved, unknown_table=bool(known.not_removed))
         solution = solution_of(summary).model_copy(update=_more(summary, wanted, report_stage))
-        doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution)
+        doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution) | known.doc
         sink(Progress("solve", float(STAGES), float(STAGES), 0.0, "done"))
     return summary, doc
 

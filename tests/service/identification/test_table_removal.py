@@ -25,6 +25,7 @@ from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
+from abbe.service.identification.effect_removal import IN_U
 from abbe.service.identification.table_removal import (
     NO_TABLE,
     NOT_REMOVED,
@@ -204,7 +205,15 @@ def test_an_exported_folder_gives_the_same_answer_as_the_database(
     (tmp_path / "out" / file).rename(tmp_path / file)
     without = solved(capsys, "out")
     assert without.table_removal is None
-    assert without.table_not_removed == f"measured with table {crc32(image):08X}, which is not in this folder: {NOT_REMOVED}"
+    missing = f"measured with table {crc32(image):08X}, which is not in this folder"
+    assert without.table_not_removed == f"{missing}: {NOT_REMOVED}; {IN_U}"
+    assert "table" in {line.source for line in without.uncertainty.budget}
+    assert "table" not in {line.source for line in read.uncertainty.budget}
+    assert abbe.solve(abbe.read_campaign(tmp_path / "out"), model="rigid6").table == without.table_not_removed
+    for where in ("", " or this database"):  # the first command makes the database
+        assert f"{missing}{where}: " in str(solved(capsys, "out", "--db", "sqlite:///empty.sqlite3").table_not_removed)
+    known = solved(capsys, "out", "--db", DB)  # which has the table
+    assert (known.table_removal, known.parameters) == (stored.table_removal, stored.parameters)
     (tmp_path / "out" / file).write_bytes(image[:-1])
     assert cli.run(["solve", "out"]) == 2
     assert "the CRC of this table is" in capsys.readouterr().err
