@@ -8,6 +8,7 @@ from abbe.service.cli.administration.audit import audit, record_all
 from abbe.service.cli.administration.backup import backup, restore
 from abbe.service.cli.administration.checks import alarm, fleet, trend
 from abbe.service.cli.administration.serve import serve
+from abbe.service.cli.administration.setting_up import doctor, init
 from abbe.service.cli.administration.system import SIM_SETTINGS, check_config, schema, sim, version
 from abbe.service.cli.administration.user import key, user
 from abbe.service.cli.demo import demo
@@ -36,6 +37,8 @@ app = typer.Typer(
 )
 
 app.command("demo", rich_help_panel=MEASURE)(demo)
+app.command("init", rich_help_panel=MEASURE)(init)
+app.command("doctor", rich_help_panel=MEASURE)(doctor)
 app.command("check-config", rich_help_panel=MEASURE)(check_config)
 app.add_typer(device, name="device", rich_help_panel=MEASURE)
 app.command("plan", rich_help_panel=MEASURE)(plan)

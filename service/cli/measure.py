@@ -104,7 +104,11 @@ def _measure(loaded: LoadedMachine, plan: CampaignPlan, source: RecipeSource, op
     site, control = site_of(loaded.machine), Control()
     begun_s = SystemClock().monotonic_s()
     with Store.open(loaded.database_url) as store:
-        run_job(_measured(store, site, plan, control, source, options), control)
+        try:
+            run_job(_measured(store, site, plan, control, source, options), control)
+        except SystemExit:
+            conclude(f"abbe measure --resume {quote(plan.name)}", machine=loaded.path, as_json=as_json)
+            raise
         doc: dict[str, Any] = {"campaign": plan.name, "runs": len(plan.tests), "check": None}
         lines = [f"measured: campaign {plan.name!r}, {len(plan.tests)} runs"]
         is_check = source.recipe in CHECKS and not source.helix

@@ -110,7 +110,7 @@ def _handled(stop: Handler, names: tuple[str, ...]) -> Iterator[None]:
 
 @contextmanager
 def display() -> Iterator[ProgressSink]:
-    """Yield a sink for progress: a bar with ETA on a terminal, one line per stage elsewhere."""
+    """Yield a sink for progress: a bar with ETA on a terminal, one line for each run or step elsewhere."""
     from rich.console import Console
 
     log = Console(stderr=True)
@@ -119,9 +119,10 @@ def display() -> Iterator[ProgressSink]:
 
         def plain(p: Progress) -> None:
             waits = _waits(p)
-            if p.stage != last[0]:
-                last[0] = p.stage
-                log.print(f"{p.stage}: {p.message}", highlight=False)
+            if (step := f"{p.stage}: {p.message}") != last[0]:
+                last[0] = step
+                share = f" ({p.done / p.total:.0%} done)" if p.done > 0.0 and p.total > 0.0 else ""
+                log.print(step + share, highlight=False, markup=False)
             if waits and waits != last[1]:
                 log.print(f"{p.stage}: {waits}", highlight=False)
             last[1] = waits

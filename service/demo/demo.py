@@ -22,6 +22,7 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.machine_text import machine_text
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site, machine_doc, machine_from_doc
@@ -67,27 +68,14 @@ def demo_site(ready: dict[str, Any]) -> Site:
 
 def write_machine_file(site: Site, folder: Path) -> Path:
     """Write a machine file for the running simulated machine, so that other commands can use it."""
-
-    def row(values: Any) -> str:
-        return "[" + ", ".join(f"{float(v):g}" for v in values) + "]"
-
-    m = site.machine
-    lines = [f'name = "{site.name}"', f'chain = "{m.chain}"', f"tool_mm = {row(m.tool_mm)}", "", "[stroke_mm]"]
-    lines += [f"{a} = {row(m.stroke_mm[k])}" for k, a in enumerate("XYZ")]
-    lines += ["", "[pivots_mm]"] + [f"{a} = {row(m.pivots_mm[k])}" for k, a in enumerate("XYZ")]
-    lines += ["", "[devices]"] + [f'{k} = "{getattr(site.urls, k)}"' for k in ("cnc", "ballbar", "laser", "fixture")]
-    lines += ["", "[calibration]"] + [f"{kind} = {day.isoformat()}" for kind, day in sorted(site.calibrated_until.items())]
-    lines += [
-        "",
-        "[limits]",
-        f"table_value_um = {site.limits.value_mm * 1e3:g}",
-        f"table_change_um = {site.limits.change_mm * 1e3:g}",
-        f"table_walk_um = {site.limits.walk_mm * 1e3:g}",
-    ]
-    lines += ["", "[store]", 'url = "sqlite:///abbe.sqlite3"', ""]
     path = folder / "machine.toml"
-    path.write_text("\n".join(lines), encoding="utf-8")
+    path.write_text(machine_file_of(site), encoding="utf-8")
     return path
+
+
+def machine_file_of(site: Site) -> str:
+    """Return the text of the machine file of a simulated machine."""
+    return machine_text(site.doc, site.urls, site.calibrated_until, site.limits)
 
 
 async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> DemoResult:

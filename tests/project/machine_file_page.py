@@ -15,7 +15,7 @@ PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "machine-fil
 _HEAD = """# Machine file
 
 `python -m tests.project.machine_file_page` writes this page from the schema (`service/config_schema.py`); a test checks that it is current.
-Start from `deploy/machine.example.toml`; `abbe check-config machine.toml` prints the values in force and where each comes from. An
+Start with `abbe init` or from `deploy/machine.example.toml`; `abbe check-config` prints the values in force and where each comes from. An
 environment variable such as `ABBE_MQTT__URL` replaces a key. An unknown key is an error. Lengths are mm, in the machine's own coordinates.
 """
 

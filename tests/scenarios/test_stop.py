@@ -67,7 +67,10 @@ def test_ctrl_c_stops_at_a_safe_place_and_the_same_campaign_goes_on_but_no_other
     _, err = interrupt(process, signal.SIGINT)
     assert process.returncode == 130, err
     assert axes_at_rest(measuring.sims)
-    assert err.splitlines()[-1] == "stopped: `abbe measure MACHINE.toml --resume CAMPAIGN` resumes it"
+    assert err.splitlines()[-2:] == [
+        "stopped: `abbe measure -m MACHINE.toml --resume CAMPAIGN` resumes it",
+        f"next: abbe measure --resume june -m {measuring.file}",
+    ]
     assert measuring.runs() == [("helix", "stopped")]
     for change in (("--helix", "300,250,100,90"), ("--recipe", "quick-check")):
         line = refused(command("measure", "-m", measuring.file, "--resume", "june", *change), "SEQ-007")

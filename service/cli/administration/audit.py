@@ -104,6 +104,8 @@ READS = frozenset(
         "check-config",
         "device list",
         "device test",
+        "doctor",
+        "init",
         "runs",
         "show",
         "export",

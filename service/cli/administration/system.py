@@ -13,10 +13,12 @@ from typing import Annotated, Any
 import typer
 
 from abbe.service.children import python_command
-from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
+from abbe.service.cli.common import DEFAULT_MACHINE, JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
 
 SIM_SETTINGS: dict[str, Any] = {"allow_extra_args": True, "ignore_unknown_options": True}
 """Everything after ``sim`` belongs to the simulators, ``--help`` included."""
+SIMULATED_DAYS = 365
+"""Days for which the certificates of simulated instruments are valid in a machine file."""
 
 
 def version(as_json: JsonOption = False) -> None:
@@ -30,18 +32,24 @@ def version(as_json: JsonOption = False) -> None:
     log = "write-ahead log" if wal_is_safe() else "no write-ahead log: this SQLite has the WAL-reset bug"
     doc = {"abbe": metadata.version("abbe"), "python": platform.python_version(), "sqlite": sqlite3.sqlite_version, "log": log}
     answer(doc, f"abbe {doc['abbe']} (Python {doc['python']}, SQLite {doc['sqlite']}, {log})", as_json=as_json)
-    conclude("abbe check-config", as_json=as_json)
+    conclude("abbe doctor", as_json=as_json)
 
 
 def sim(context: typer.Context) -> None:
-    """Run the simulated machine and its instruments; arguments go to the module `abbe.simulators`."""
+    """Run the simulated machine and its instruments until Ctrl-C; --machine-file FILE: write a machine file for them.
+
+    Prints one JSON object with the addresses. Other arguments go to the module `abbe.simulators`.
+    """
     # Its own process group: Ctrl-C reaches the child once, from here, and not again from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     arguments = [word for word in context.args if word != "--json"]  # it prints nothing else
+    file = _machine_file_of(arguments)
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:
         # The child ends when this pipe closes, even if this process is killed by SIGKILL.
         arguments.append("--watch-stdin")
         own_group["stdin"] = subprocess.PIPE
+    if file is not None:
+        own_group["stdout"] = subprocess.PIPE
     child = subprocess.Popen(python_command("abbe.simulators", *arguments), **own_group)  # noqa: S603 - our own package
 
     def forward(number: int, _frame: FrameType | None) -> None:
@@ -50,6 +58,8 @@ def sim(context: typer.Context) -> None:
 
     handlers = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
+        if file is not None and child.stdout is not None:
+            _write_machine_file(child.stdout.readline(), file)
         code = child.wait()
     finally:
         for number, handler in handlers.items():
@@ -58,6 +68,38 @@ def sim(context: typer.Context) -> None:
             child.kill()
             child.wait()
     raise typer.Exit(code if code >= 0 else 128 - code)
+
+
+def _machine_file_of(arguments: list[str]) -> Path | None:
+    """Take ``--machine-file FILE`` out of the arguments and return the file."""
+    from abbe.service.errors import ConfigError
+
+    if "--machine-file" not in arguments:
+        return None
+    at = arguments.index("--machine-file")
+    if at + 1 == len(arguments):
+        raise ConfigError("--machine-file has no file", "write --machine-file abbe.toml")
+    _, name = arguments.pop(at), arguments.pop(at)
+    if Path(name).exists():
+        raise ConfigError(f"{name} exists", "remove it, or give another name")
+    return Path(name)
+
+
+def _write_machine_file(line: bytes, file: Path) -> None:
+    """Write the machine file of simulators that have told their addresses; nothing if they have ended."""
+    from dataclasses import replace
+    from datetime import timedelta
+
+    from abbe.service.clock import SystemClock
+    from abbe.service.demo.demo import demo_site, machine_file_of
+    from abbe.service.rendering.page_file import write_page
+
+    if not line.strip():
+        return
+    site, day = demo_site(json.loads(line)), SystemClock().utc().date() + timedelta(days=SIMULATED_DAYS)
+    write_page(machine_file_of(replace(site, calibrated_until=dict.fromkeys(site.calibrated_until, day))), file)
+    typer.echo(line.decode().rstrip())
+    conclude("abbe doctor", machine=None if file == Path(DEFAULT_MACHINE) else file)
 
 
 def check_config(
@@ -87,7 +129,7 @@ def check_config(
         typer.echo(f"warning: {visible(line)}", err=True)
     for line in found.errors:
         typer.echo(f"error {ConfigError.code}: {visible(line)}", err=True)
-    then = "abbe check-config" if found.errors else "abbe measure --dry-run"
+    then = "abbe check-config" if found.errors else "abbe doctor"
     conclude(then, machine=machine, verdict=f"{file}: {len(found.errors)} errors, {len(found.warnings)} warnings")
     raise typer.Exit(2 if found.errors else 0)
 

@@ -300,7 +300,7 @@ def main() -> None:
     """Plan, measure twice, compare; exit code 1 when a parameter differs by more than 4 u, or 2 u too often, or when nothing happened."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--folder", type=Path, required=True)
-    parser.add_argument("--recipe", type=Path, required=True, help="recipe of `abbe plan MACHINE.toml --minutes 60 --out FILE.toml`")
+    parser.add_argument("--recipe", type=Path, required=True, help="recipe of `abbe plan -m MACHINE.toml --minutes 60 --out FILE.toml`")
     parser.add_argument("--speed", type=float, default=60.0)
     parser.add_argument("--every-s", type=float, default=20.0)
     parser.add_argument("--regular", action="store_true", help="exactly every so many seconds, instead of on average")

@@ -168,7 +168,7 @@ async def test_a_stop_while_it_is_solved_leaves_no_proposal(monkeypatch: pytest.
     monkeypatch.setattr(work, "make_proposal", made)
     with pytest.raises(Stopped) as told:
         await work.run_guided_campaign(pretended(), {}, "bob")
-    assert "abbe comp propose MACHINE.toml 'full 1'" in told.value.__notes__[0]
+    assert "abbe comp propose -m MACHINE.toml 'full 1'" in told.value.__notes__[0]
 
 
 async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wait() -> None:
