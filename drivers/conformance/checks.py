@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from abbe.drivers.conformance.probe import Probe, Sample
+from abbe.drivers.described.meter import INVALID
 from abbe.drivers.described.registers import ORDERS, decode, ours
 from abbe.drivers.described.tested import Finding, Verdict
 from abbe.drivers.device_file import SIZE, DeviceFile
@@ -16,12 +17,15 @@ from abbe.drivers.errors import DriverError
 
 Ask = Callable[[str], Awaitable[object]]
 PASSED, FAILED, NOT_PROVED = Verdict.PASSED, Verdict.FAILED, Verdict.NOT_PROVED
-SAMPLES = 40
+SAMPLES = 10
+"""Least number of readings at rest, and how long they are taken at least, s."""
+AVERAGED = 3
 WATCHED_S = 1.0
 CLOCK_FACTOR = 2.0
 """The device's clock may differ from this computer's by this factor in a test of a second; a wrong unit differs by 1000."""
 FACTORS = (
-    (25.4, "inches are read as mm"),
+    (25.4, "it sends mm, the file says inches"),
+    (1.0 / 25.4, "it sends inches, the file says mm"),
     (1e3, "the unit is 1000 times too large"),
     (1e-3, "the unit is 1000 times too small"),
     (2.0, "an interferometer that counts the path there and back?"),
@@ -81,7 +85,7 @@ def _fresh(file: DeviceFile | None) -> Finding:
         return Finding("freshness", PASSED, "by its driver")
     stamp = next((name for name in ("counter", "time") if name in file.values), None)
     if stamp is not None:
-        return Finding("freshness", PASSED, f"every reading had a new {stamp}")
+        return Finding("freshness", PASSED, f"its {stamp} is checked with every reading")
     if file.line is not None:
         return Finding(
             "freshness", PASSED, "every reading was the answer to a question" if file.line.mode == "poll" else "a line of its own"
@@ -146,7 +150,7 @@ async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, a
 
 async def _mean(probe: Probe, name: str) -> float:
     number, values = None, []
-    for _ in range(5):
+    for _ in range(AVERAGED):
         sample = await probe.sample(number)
         number = sample.number
         values.append(sample.values[name])
@@ -187,15 +191,20 @@ def _other_order(file: DeviceFile | None, name: str, words: tuple[tuple[int, ...
     return ""
 
 
+def _bad(file: DeviceFile | None) -> list[str]:
+    """What tells an invalid reading."""
+    if file is None:
+        return ["an error of its driver"]
+    found: list[str] = sorted({flag.means for flag in file.flags} & INVALID)
+    found += ["an error line"] if file.line is not None and file.line.error else []
+    return [*found, "a reading out of range_mm"] if file.limits.range_mm is not None else found
+
+
 async def quality(probe: Probe, file: DeviceFile | None, ask: Ask) -> Finding:
     """Have the beam blocked or the plunger lifted: the reading must become invalid."""
-    bad = (
-        sorted({flag.means for flag in file.flags} & {"beam lost", "no reflector", "out of range", "fault"}) if file is not None else ["?"]
-    )
+    bad = _bad(file)
     if not bad:
-        return Finding("quality", NOT_PROVED, "the device file names no flag of an invalid reading")
-    if not probe.moved:
-        return Finding("quality", NOT_PROVED, "not tried for this kind")
+        return Finding("quality", NOT_PROVED, "the device file names nothing by which an invalid reading could be told")
     try:
         await ask("Block the beam, or lift the plunger out of its range.")
         try:

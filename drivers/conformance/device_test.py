@@ -62,7 +62,7 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
         found = [*await identity(probe, file), *await rate(probe, file)]
         if options.ask is not None and options.move is not None:
             found += await motion(probe, file, options.move, options.ask)
-            found.append(await quality(probe, file, options.ask))
+            found += [await quality(probe, file, options.ask)] if "displacement" in probe.moved else []
         else:
             found += [Finding(f"motion {name}", Verdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
     finally:

@@ -10,9 +10,9 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from abbe.drivers.api import NOTHING_HOLDS, CompStatus, Condition, ControllerStatus, DeviceInfo, Point, TableFormat
-from abbe.drivers.described.source import Source, meanings, physical
+from abbe.drivers.described.source import Snapshot, Source, meanings, physical
 from abbe.drivers.device_file import DeviceFile
-from abbe.drivers.errors import DeviceFault, NotProved
+from abbe.drivers.errors import DeviceFault, NotProved, ReplyTimeout
 from abbe.drivers.links.incidents import Incidents
 
 CONDITIONS = {
@@ -24,6 +24,8 @@ CONDITIONS = {
     "measure now": Condition.IN_POSITION,
     "nc program": Condition.NC_PROGRAM,
 }
+STUCK_S = 0.5
+"""A counter that stays the same for longer, beyond the ``update_s`` of the device file, is stuck."""
 UNKNOWN: Point = (float("nan"), float("nan"), float("nan"))
 """Position of a control that shows none."""
 
@@ -37,6 +39,7 @@ class ListenedControl:
         self.file, self.source = file, source
         self.name = "the control" if source is None else source.name
         self.incidents = Incidents() if source is None else source.incidents
+        self._counted: tuple[float | None, float] = (None, 0.0)
 
     async def identify(self) -> DeviceInfo:
         """Identify the device; errors as those of its wire."""
@@ -51,7 +54,9 @@ class ListenedControl:
         ------
         DeviceFault
             The device reports a position that is not valid.
-        Rebooted, WrongDevice, LinkDown, ReplyTimeout, BadFrame
+        ReplyTimeout
+            No answer, or the counter of the positions is stuck.
+        Rebooted, WrongDevice, LinkDown, BadFrame
             The device restarted or is another one, or communication failed.
         """
         if self.source is None or self.file is None:
@@ -64,6 +69,7 @@ class ListenedControl:
         holds = NOTHING_HOLDS
         for meaning in found & CONDITIONS.keys():
             holds |= CONDITIONS[meaning]
+        self._check_renewed(snapshot)
         x, y, z = (physical(self.file, snapshot.counts, axis) for axis in "xyz")
         return _status(snapshot.host_s, holds, (x, y, z))
 
@@ -71,6 +77,15 @@ class ListenedControl:
         """Close the link. Closing twice does nothing."""
         if self.source is not None:
             await self.source.close()
+
+    def _check_renewed(self, snapshot: Snapshot) -> None:
+        """Refuse positions whose counter has not changed for longer than the device may show old values."""
+        count = snapshot.counts.get("counter")
+        if count is None or count != self._counted[0]:
+            self._counted = (count, snapshot.host_s)
+        elif snapshot.host_s - self._counted[1] > STUCK_S + (0.0 if self.file is None else self.file.limits.update_s or 0.0):
+            detail = f"its counter is stuck at {count:g}: the device repeats old positions"
+            raise ReplyTimeout(self.name, "read status", detail, "does its program run?")
 
     def _refuse(self, operation: str, what: str) -> NoReturn:
         raise NotProved(self.name, operation, f"this control can only be listened to: {what}", "connect a control that proves it")

@@ -8,7 +8,7 @@ import math
 from abbe.drivers.api import DeviceInfo, LaserFlag, LaserReading
 from abbe.drivers.described.registers import TO_OURS
 from abbe.drivers.described.source import Snapshot, Source, meanings, physical
-from abbe.drivers.device_file import SIZE, DeviceFile
+from abbe.drivers.device_file import SIZE, Command, DeviceFile
 from abbe.drivers.errors import DeviceFault, NotProved, Refused, ReplyTimeout
 
 FLAGS = {
@@ -18,6 +18,7 @@ FLAGS = {
     "out of range": LaserFlag.BEAM_LOST,
     "fault": LaserFlag.BEAM_LOST,
 }
+INVALID = FLAGS.keys() - {"signal low"}
 LOSES_ZERO = {"beam lost", "no reflector", "fault"}
 """States after which an incremental instrument must be zeroed anew."""
 TENTH_NM_PER_MM = 1e7
@@ -68,13 +69,12 @@ class DescribedMeter:
         ReplyTimeout, LinkDown, BadFrame
             Communication failed.
         """
-        snapshot = await self._new(None)
-        if bad := meanings(self.file, snapshot.counts) & FLAGS.keys():
+        snapshot = await self._new(self._not_before)
+        if bad := meanings(self.file, snapshot.counts) & INVALID:
             raise DeviceFault(self.name, "zero", ", ".join(sorted(bad)), "free beam or plunger first")
         if self.file.zero is not None:
-            await self.source.command(self.file.zero, "zero")
-            await asyncio.sleep(self.file.limits.update_s or 0.0)
-            snapshot = await self._new(self._count)
+            await self._command(self.file.zero, "zero")
+            snapshot = await self._new(self._not_before)
             found_mm = physical(self.file, snapshot.counts, "displacement")
             if not abs(found_mm) < ZEROED_MM:
                 raise Refused(self.name, "zero", f"it reads {found_mm:.4f} mm after its zero command", "does the command fit the device?")
@@ -86,7 +86,7 @@ class DescribedMeter:
     async def clear_beam(self) -> None:
         """Clear a latched loss, if the device has a command for that; errors as for `zero`."""
         if self.file.clear is not None:
-            await self.source.command(self.file.clear, "clear")
+            await self._command(self.file.clear, "clear")
 
     async def set_environment_compensation(self, on: bool) -> None:
         """Do nothing, because such a device has no switch for it.
@@ -117,7 +117,7 @@ class DescribedMeter:
         floor = max((c for c in (after_count, self._not_before) if c is not None), default=None)
         snapshot = await self._new(floor)
         self._not_before = None
-        bad = meanings(self.file, snapshot.counts) & FLAGS.keys() - {"signal low"}
+        bad = meanings(self.file, snapshot.counts) & INVALID
         reading = self._reading(snapshot)
         if bad:
             raise DeviceFault(self.name, "read", ", ".join(sorted(bad)), "free beam or plunger, zero it, then repeat this test")
@@ -134,6 +134,12 @@ class DescribedMeter:
     async def close(self) -> None:
         """Close the link. Closing twice does nothing."""
         await self.source.close()
+
+    async def _command(self, command: Command, operation: str) -> None:
+        """Send a command; it acts on the readings after the one that is shown now."""
+        await self.source.command(command, operation)
+        await asyncio.sleep(self.file.limits.update_s or 0.0)
+        self._not_before = self._counted(await self.source.snapshot())
 
     async def _new(self, after: int | None) -> Snapshot:
         """Return a snapshot with a sample number above ``after``."""

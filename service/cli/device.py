@@ -7,17 +7,21 @@ from typing import Annotated
 
 import typer
 
+from abbe.service.cli.common import JsonOption, print_json, print_table
+
 device = typer.Typer(no_args_is_help=True, help="Test devices, list the device files that come with Abbe.")
 
 
 @device.command("list")
-def list_files() -> None:
+def list_files(as_json: JsonOption = False) -> None:
     """List the device files that come with Abbe; `device=NAME` in a URL uses one."""
     from abbe.drivers.device_file import SHIPPED, load
 
-    for path in sorted(SHIPPED.glob("*.toml")):
-        file, _ = load(path.stem)
-        typer.echo(f"{path.stem:24} {file.kind:13} {file.name}")
+    found = [(path.stem, load(path.stem)[0]) for path in sorted(SHIPPED.glob("*.toml"))]
+    if as_json:
+        print_json([{"name": name, "kind": file.kind, "device": file.name} for name, file in found])
+        return
+    print_table(("name", "kind", "device"), [(name, file.kind, file.name) for name, file in found])
 
 
 @device.command("test")
@@ -28,6 +32,7 @@ def try_device(
     tolerance: Annotated[float, typer.Option(metavar="MM", help="How exactly that motion is known, mm.")] = 0.05,
     faults: Annotated[bool, typer.Option("--faults/--no-faults", help="Play late, doubled, spoilt and missing replies.")] = True,
     out: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Keep the report; tested=FILE.json in the URL uses it.")] = None,
+    as_json: JsonOption = False,
 ) -> None:
     """Test identity, rate, freshness, noise, sign, scale, quality bits and bad replies of a device; exit code 1 if a check failed."""
     import asyncio
@@ -44,11 +49,12 @@ def try_device(
         raise ConfigError(f"--tolerance {tolerance:g} does not fit --move {move:g}", "give more than 0 and less than a fifth of the motion")
     options = Options(role, Move(move, tolerance) if move else None, person_at_console() if move else None, faults)
     report = asyncio.run(device_test(url, options, SystemClock().utc().isoformat()))
-    typer.echo(f"{report.kind}: {report.model} {report.serial_no}".rstrip())
-    for one in report.findings:
-        typer.echo(f"{one.verdict:10} {one.check}: {one.text}")
-    typer.echo(summary(report))
     if out is not None:
         write_page(json.dumps(report.to_document(), indent=2) + "\n", out)
-        typer.echo(f"report: {out}")
+    if as_json:
+        print_json(report.to_document())
+    else:
+        lines = [f"{one.verdict:10} {one.check}: {one.text}" for one in report.findings]
+        kept = [] if out is None else [f"report: {out}"]
+        typer.echo("\n".join([f"{report.kind}: {report.model} {report.serial_no}".rstrip(), *lines, summary(report), *kept]))
     raise typer.Exit(1 if report.failed else 0)

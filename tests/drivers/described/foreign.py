@@ -9,7 +9,7 @@ import socket
 import struct
 import subprocess
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -88,10 +88,18 @@ def program(*words: str, ready: str = "") -> Iterator[subprocess.Popen[str]]:
 def serial_pair(folder: Path) -> Iterator[tuple[Path, Path]]:
     """Two joined ptys of socat."""
     ours, theirs = folder / "ours", folder / "theirs"
-    with program("socat", f"pty,raw,echo=0,link={ours}", f"pty,raw,echo=0,link={theirs}") as process:
-        end = time.monotonic() + within(10)
-        while not (ours.exists() and theirs.exists()):
-            assert time.monotonic() < end, "socat made no ptys"
-            assert process.poll() is None
-            select.select([], [], [], 0.01)
+    with program("socat", f"pty,raw,echo=0,link={ours}", f"pty,raw,echo=0,link={theirs}"):
+        wait_for(lambda: ours.exists() and theirs.exists(), "ptys of socat")
         yield ours, theirs
+
+
+def listens(port: int) -> bool:
+    """Whether somebody listens on a port of 127.0.0.1; connecting would use up a server for one client."""
+    return f"0100007F:{port:04X} 00000000:0000 0A" in Path("/proc/net/tcp").read_text()
+
+
+def wait_for(condition: Callable[[], object], what: str) -> None:
+    end = time.monotonic() + within(10)
+    while not condition():
+        assert time.monotonic() < end, f"not within 10 s: {what}"
+        select.select([], [], [], 0.01)

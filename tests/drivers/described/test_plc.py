@@ -1,0 +1,97 @@
+"""A PLC with three positions, made with the server of another library: a copy of the shipped file describes it; it is never commanded."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+from pymodbus.server import ModbusTcpServer
+from pymodbus.simulator import DataType, SimData, SimDevice
+
+from abbe.drivers.api import Condition, only_listens
+from abbe.drivers.conformance.checks import Move
+from abbe.drivers.conformance.device_test import Options, device_test
+from abbe.drivers.described.opening import open_control
+from abbe.drivers.described.tested import Ability
+from abbe.drivers.device_file import SHIPPED
+from abbe.drivers.errors import WrongDevice
+from abbe.drivers.links.urls import parse_url
+from abbe.drivers.registry import open_controller
+from tests.drivers.described.foreign import free_port
+from tests.drivers.described.test_device_test import UTC, kept, verdict
+
+
+class Plc:
+    """Positions in um and flags, little-endian to the last byte (DCBA); it asks nobody and is asked."""
+
+    def __init__(self) -> None:
+        self.at_um = [1000, 2000, 3000]
+        self.flags = 0
+        self.cycles = 0
+        self.stuck = False
+
+    async def renew(self, function: int, start: int, address: int, count: int, registers: list[int], values: object) -> None:
+        self.cycles += not self.stuck
+        data = struct.pack("<I6x", 0x41424245) + bytes(10) + struct.pack("<3iHH", *self.at_um, self.cycles & 0xFFFF, self.flags)
+        registers[: len(data) // 2] = struct.unpack(f">{len(data) // 2}H", data)
+
+    async def person(self, text: str) -> None:
+        self.at_um = [at + 5000 * (f"axis {axis}" in text) for at, axis in zip((1000, 2000, 3000), "XYZ", strict=True)]
+
+
+@pytest.fixture
+async def plc(tmp_path: Path) -> AsyncIterator[tuple[Plc, str]]:
+    made, port = Plc(), free_port()
+    device = SimDevice(id=1, simdata=[SimData(address=0, count=30, values=0, datatype=DataType.REGISTERS)], action=made.renew)
+    server = ModbusTcpServer(device, address=("127.0.0.1", port))
+    serving = asyncio.create_task(server.serve_forever(background=True))
+    await serving
+    file = tmp_path / "plc.toml"
+    text = (SHIPPED / "plc-positions.toml").read_text()
+    file.write_text(text.replace('order = "CDAB" ', 'order = "DCBA" '))
+    yield made, f"modbus+tcp://127.0.0.1:{port}?device={file}"
+    await server.shutdown()
+
+
+async def test_its_positions_and_flags_are_those_of_a_control(plc: tuple[Plc, str], tmp_path: Path) -> None:
+    made, url = plc
+    report = await device_test(url, Options(move=Move(5.0, 0.01), ask=made.person, faults=False), UTC)
+    assert report.failed == ()
+    assert report.abilities == (Ability.WATCH, Ability.DWELL)
+    assert verdict(report, "byte order") == ("passed", "DCBA, by the identity registers")
+    control = await open_controller(f"{url}&tested={kept(report, tmp_path)}")
+    made.flags = 0b0011
+    status = await control.status()
+    assert (status.position_mm, status.conditions) == ((1.0, 2.0, 3.0), Condition.IN_POSITION | Condition.NC_PROGRAM)
+    assert only_listens(control)
+    await control.close()
+
+
+async def test_positions_that_are_not_renewed_are_refused(plc: tuple[Plc, str]) -> None:
+    made, url = plc
+    made.stuck = True
+    report = await device_test(url, Options(move=Move(5.0, 0.01), ask=made.person, faults=False), UTC)
+    assert "its counter is stuck at" in verdict(report, "readings")[1]
+    assert report.abilities == ()
+
+
+async def test_the_shipped_order_is_not_that_of_this_plc(plc: tuple[Plc, str]) -> None:
+    _, url = plc
+    with pytest.raises(WrongDevice, match="its byte order is DCBA"):
+        await open_control(parse_url(url.partition("?")[0] + "?device=plc-positions"))
+
+
+async def test_an_axis_the_wrong_way_round_is_named(plc: tuple[Plc, str]) -> None:
+    made, url = plc
+
+    async def crossed(text: str) -> None:
+        await made.person(text)
+        made.at_um[1] = 4000 - made.at_um[1]
+
+    report = await device_test(url, Options(move=Move(5.0, 0.01), ask=crossed, faults=False), UTC)
+    assert [one.check for one in report.failed] == ["motion y"]
+    assert "sign: it grows the wrong way" in report.failed[0].text
+    assert report.abilities == ()
