@@ -1,4 +1,4 @@
-"""The history of an alarm for people: every entry with the person behind it."""
+"""Alarms for people: the history of one with the person behind each entry, and those of a check."""
 
 from __future__ import annotations
 
@@ -6,7 +6,9 @@ from dataclasses import dataclass
 from datetime import datetime
 
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.queries.status import AlarmSummary, summaries
 from abbe.service.storage.store import Store
+from abbe.service.verification.alarm_states import folded
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -38,3 +40,10 @@ def _line(one: AlarmEntryRecord) -> AlarmLine:
         verification=doc.get("verification"),
         until_utc=None if until is None else datetime.fromisoformat(until),
     )
+
+
+def alarms_of_check(store: Store, machine: str, verification: int) -> list[AlarmSummary]:
+    """The alarms that a check raised, held or cleared."""
+    entries = store.alarms.entries(machine)
+    numbers = {one.alarm for one in entries if one.doc.get("verification") == verification}
+    return [one for one in summaries(folded(entries), every=True) if one.alarm in numbers]

@@ -38,6 +38,7 @@ from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render
 from abbe.service.web.pages.alarms import add_alarm_pages
+from abbe.service.web.pages.check import add_check_page
 from abbe.service.web.pages.context import PageContext
 from abbe.service.web.pages.new import add_live_page, add_new_page
 from abbe.service.web.pages.plant_screens import add_plant_screens
@@ -140,6 +141,7 @@ def create_app(
         context = _page_context(source, auth, api)
         add_pages(app, context)
         add_alarm_pages(app, context)
+        add_check_page(app, context)
         add_live_page(app, context, parts.core.jobs if parts is not None else tuple)
         add_new_page(app, context, parts.plans if parts is not None else Rehearsals())
         if api is not None:

@@ -31,7 +31,7 @@ CHOICES: Mapping[str, tuple[str, Collection[str]]] = {
 """Display options that a reader sets in the query of any screen: cookie and allowed values."""
 Screen = tuple[str, str, Permission, tuple[str, ...]]
 SCREENS: tuple[Screen, ...] = (
-    ("/", "nav.home", Permission.READ, ("/",)),
+    ("/", "nav.home", Permission.READ, ("/", "/check")),
     ("/alarms", "nav.alarms", Permission.READ, ("/alarms", "/alarm")),
     ("/live", "nav.live", Permission.READ, ("/live", "/new")),
     ("/runs", "nav.runs", Permission.READ, ("/runs", "/run", "/compare")),

@@ -63,6 +63,7 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         latest_figures=[] if latest is None else _judged_first(latest),
         trends=trends(past, zone, changes),
         verified=status.verified,
+        sentence=sentence,
         earlier=lambda check: bool(changes) and not check.push and check.started_utc <= changes[-1],
         marks=MARKS,
         zone=zone,
@@ -110,7 +111,7 @@ def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]
     u = converted(check.uncertainties.get(key) or 0.0, unit, system)
     line = None if limit is None else converted(limit, unit, system)
     earlier = bool(changes) and check.started_utc <= changes[-1]
-    return Point(check.started_utc, converted(value, unit, system), u, line, figure_verdict(check, key), earlier)
+    return Point(check.started_utc, converted(value, unit, system), u, line, figure_verdict(check, key), earlier, f"/check?id={check.id}")
 
 
 def figure_verdict(check: Verification, key: str) -> str:
@@ -118,9 +119,27 @@ def figure_verdict(check: Verification, key: str) -> str:
 
     If the check's verdict has another reason than its figures (e.g. the temperature), it applies to each figure.
     """
-    found = {name: _judged(check, name) for name in check.limits if check.values.get(name) is not None}
+    found = own_verdicts(check)
     worst = next((verdict for verdict in ("fail", "cannot tell", "pass") if verdict in found.values()), None)
     return found.get(key, check.verdict) if worst == check.verdict else check.verdict
+
+
+def own_verdicts(check: Verification) -> dict[str, str]:
+    """Verdict of each figure with a limit, by its value and U alone."""
+    return {name: _judged(check, name) for name, limit in check.limits.items() if limit is not None and check.values.get(name) is not None}
+
+
+def sentence(check: Verification) -> str:
+    """What a check says of the machine, in the reader's words; a verdict with another reason than its figures keeps its stored sentence."""
+    frame = current()
+    if check.cause is not None:
+        return f"{frame.translate('check.stopped')} {check.cause.what}"
+    verdicts = own_verdicts(check)
+    named = [name for name, verdict in verdicts.items() if verdict == check.verdict]
+    if not named or (check.verdict == "pass" and len(named) < len(verdicts)) or (check.verdict != "fail" and "fail" in verdicts.values()):
+        return check.text
+    names = ", ".join(language.figure(frame.lang, name)[0] for name in named)
+    return frame.translate(f"check.{check.verdict}", names=names)
 
 
 def _judged(check: Verification, key: str) -> str:

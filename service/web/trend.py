@@ -16,7 +16,7 @@ LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
 
 @dataclass(frozen=True, slots=True)
 class Point:
-    """A figure of one check. ``verdict`` is that of the figure, not of the check; ``earlier``: measured with an earlier table."""
+    """A figure of one check. ``verdict`` is that of the figure; ``earlier``: measured with an earlier table; ``href``: its screen."""
 
     at: datetime
     value: float
@@ -24,6 +24,7 @@ class Point:
     limit: float | None
     verdict: str
     earlier: bool = False
+    href: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,4 +145,5 @@ def _mark(point: Point, px: float, y: _PixelScale, unit: str) -> list[str]:
         mark = f'<path class="fail{earlier}" d="M{px - 5:.1f} {middle - 5:.1f}l10 10m0 -10l-10 10">{hover}</path>'
     else:
         mark = f'<path class="unclear{earlier}" d="M{px:.1f} {middle - 5:.1f}l5 5l-5 5l-5 -5z">{hover}</path>'
-    return [bar, mark]
+    # A script opens the screen of the check; the table of the checks has the same links for the keyboard.
+    return [bar, f'<g data-href="{escape(point.href)}">{mark}</g>' if point.href else mark]

@@ -22,7 +22,7 @@ from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 
 GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024
-BY_FORM = ("/login", "/logout", "/proposal/approve")
+BY_FORM = ("/login", "/logout", "/proposal/approve", "/alarm/acknowledge", "/alarm/shelve")
 """Not in the OpenAPI document; that these are all is asked in tests/service/web/test_bodies.py."""
 PATIENCE_S = 30.0
 

@@ -65,7 +65,7 @@ def trace_plot(trace: Trace, *, key: str) -> str:
         svg.rect((panel.left, panel.y(edge)), (panel.width, panel.y(-edge) - panel.y(edge)), "band")
         panel.draw_y(svg, "µm", count=4)
         panel.draw_x(svg, trace.x_label if i else "", numbers=bool(i))
-        for k in _thinned(y):
+        for k in thinned(y):
             svg.dot(panel.at(float(trace.x[k]), float(y[k])), 1.4, style)
         svg.text((panel.left + 8.0, panel.top + 15.0), word, "t-halo")
         panel.draw_frame(svg)
@@ -100,7 +100,7 @@ def place_plot(place: PlaceMap, *, key: str) -> str:
     return svg.render()
 
 
-def _thinned(y: NDArray[np.float64]) -> Sequence[int]:
+def thinned(y: NDArray[np.float64]) -> Sequence[int]:
     """Indices of evenly spaced points and of the largest value per bin, so that no spike is lost."""
     if y.size <= MAX_POINTS:
         return range(y.size)

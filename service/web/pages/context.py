@@ -47,7 +47,11 @@ class PageContext:
         """Respond with a screen; its times are in the zone of the timetable."""
         now = await self.source.status()
         zone = zone_of(now)
-        values |= {"bar": strip_of(now), "machine": now.machine, "zone": zone, "stamp": lambda text: stamp(text, zone)}
+        values = (
+            {"now": now.now_utc}
+            | values
+            | {"bar": strip_of(now), "machine": now.machine, "zone": zone, "stamp": lambda text: stamp(text, zone)}
+        )
         return HTMLResponse(self.env.get_template(template).render(**values), status)
 
     async def missing(self, what: str, number: int) -> HTMLResponse:

@@ -100,6 +100,10 @@ async function showEnd() {
   const ended = answer?.ok ? await answer.json() : null;
   setText("live-outcome", words["live.ended"].replace("{state}", ended ? words[`slot.${ended.state}`] ?? ended.state : "–"));
   setText("live-text", ended?.text ?? "");
+  if (ended?.verification) {
+    find("live-check").hidden = false;
+    find("live-check").querySelector("a").href = `/check?id=${ended.verification}`;
+  }
   if (ended?.proposal) {
     find("live-made").hidden = false;
     find("live-made").querySelector("a").href = `/proposal?id=${ended.proposal}`;

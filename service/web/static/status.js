@@ -86,6 +86,8 @@ async function stop(button) {
 document.addEventListener("click", (event) => {
   const button = event.target.closest("#stop");
   if (button) stop(button);
+  const point = event.target.closest("[data-href]");
+  if (point) location.assign(point.dataset.href);
 });
 
 function ask(path, active) {

@@ -1,0 +1,182 @@
+"""The screen of one check: verdict, a gauge for each figure, curves over those of the last check that passed, alarms, next step, report."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from fastapi import FastAPI
+from fastapi.responses import HTMLResponse
+from markupsafe import Markup
+
+from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.verification import CheckFigure, Verification
+from abbe.service.errors import AbbeError, NotStored
+from abbe.service.queries.alarm_lines import alarms_of_check
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.results import check as stored_check
+from abbe.service.queries.results import checks
+from abbe.service.queries.status import AlarmSummary
+from abbe.service.rendering.model import PolarTrace
+from abbe.service.rendering.plots.curves import overlay_plot
+from abbe.service.rendering.plots.gap import thinned
+from abbe.service.rendering.plots.polar import polar_plot
+from abbe.service.runs.cases import with_earliest_mounting
+from abbe.service.runs.columns import load_run
+from abbe.service.runs.observations import run_data
+from abbe.service.users.roles import Permission
+from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, curve, incomparable_reason
+from abbe.service.web import language
+from abbe.service.web.frame import current
+from abbe.service.web.gauge import gauge_svg
+from abbe.service.web.login.access import needs
+from abbe.service.web.page import MARKS, figure_verdict, sentence
+from abbe.service.web.pages.context import Number, PageContext
+from abbe.service.web.pages.runs import MALFORMED
+from abbe.service.web.units import converted
+
+LOOK_BACK = 200
+"""Number of earlier checks among which the last good one is searched."""
+
+
+@dataclass(frozen=True, slots=True)
+class Gauge:
+    """A figure in the reader's words and units; ``change``: value and U of its change since the last good check, None without one."""
+
+    name: str
+    unit: str
+    value: str
+    u: str
+    limit: str
+    verdict: str
+    picture: Markup
+    change: tuple[str, str] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class CheckScreen:
+    """One check. ``good``: the last earlier one of the recipe that passed; ``runs``: of its campaign; ``trouble``: why no curves."""
+
+    check: Verification
+    sentence: str
+    gauges: Sequence[Gauge]
+    good: Verification | None = None
+    pictures: Sequence[Markup] = ()
+    runs: Sequence[RunRecord] = ()
+    alarms: Sequence[AlarmSummary] = ()
+    trouble: str = ""
+    older: int | None = None
+    newer: int | None = None
+
+
+def add_check_page(app: FastAPI, context: PageContext) -> None:
+    """Add the screen of a check to the application."""
+
+    @app.get("/check", include_in_schema=False)
+    @needs(Permission.READ)
+    async def check(id: Number = None) -> HTMLResponse:
+        newest = await context.source.verifications(1) if id is None else []
+        number = newest[0].id if newest else id
+        if number is None:
+            return await context.show("check.html", screen=None)
+        try:
+            screen = await context.read(check_screen, context.reader, number)
+        except NotStored:
+            return await context.missing("check", number)
+        return await context.show("check.html", screen=screen, marks=MARKS)
+
+
+def check_screen(reader: Reader, number: int) -> CheckScreen:
+    """A check with its curves. Raises NotStored, Unusable."""
+    one = stored_check(reader, number)
+    around = [c for c in checks(reader, one.machine, None, number, LOOK_BACK)[0] if c.id < number]
+    good = next((c for c in around if c.verdict == "pass" and c.recipe == one.recipe and not c.push), None)
+    runs, pictures, trouble = _curves(reader, one, good)
+    newer = min((c.id for c in checks(reader, one.machine, None, None, LOOK_BACK)[0] if c.id > number), default=None)
+    gauges = [_gauge(one, figure, good) for figure in one.figures if figure.value is not None]
+    return CheckScreen(
+        one,
+        sentence(one),
+        sorted(gauges, key=lambda gauge: gauge.limit == "–"),
+        good,
+        pictures,
+        runs,
+        alarms_of_check(reader.store, one.machine, number),
+        trouble,
+        around[0].id if around else None,
+        newer,
+    )
+
+
+def _gauge(check: Verification, figure: CheckFigure, good: Verification | None) -> Gauge:
+    frame, value = current(), figure.value or 0.0
+    name, unit = language.figure(frame.lang, figure.name)
+    told, u = frame.with_u(value, None if figure.expanded is None else figure.expanded / 2.0, unit)
+    limit = "–" if figure.limit is None else frame.length(f"{figure.limit:g}", unit)
+    words = {"name": name, "value": told, "u": u, "unit": frame.unit(unit), "limit": limit}
+    title = frame.translate("check.gauge.open" if figure.limit is None else "check.gauge", **words)
+    drawn = [None if v is None else converted(v, unit, frame.units) for v in (value, figure.expanded, figure.limit)]
+    verdict = figure_verdict(check, figure.name) if figure.limit is not None else ""
+    picture = Markup(gauge_svg(title, drawn[0] or 0.0, drawn[1], drawn[2], verdict or "plain"))  # noqa: S704 - our own writer, which escapes
+    return Gauge(name, frame.unit(unit), told, u, limit, verdict, picture, _change(figure, good, unit))
+
+
+def _change(figure: CheckFigure, good: Verification | None, unit: str) -> tuple[str, str] | None:
+    """The change of a figure with the U of two independent checks; None if one of the two is not known."""
+    before = None if good is None else next((f for f in good.figures if f.name == figure.name), None)
+    if before is None or None in (before.value, before.expanded, figure.value, figure.expanded):
+        return None
+    u = ((before.expanded or 0.0) ** 2 + (figure.expanded or 0.0) ** 2) ** 0.5 / 2.0
+    change = (figure.value or 0.0) - (before.value or 0.0)
+    value, expanded = current().with_u(change, u, unit)
+    return f"+{value}" if change > 0.0 else value, expanded
+
+
+def _curves(reader: Reader, check: Verification, good: Verification | None) -> tuple[list[RunRecord], list[Markup], str]:
+    """Runs of a check, and a picture of each over that of the last good check along the same path."""
+    try:
+        runs, before = _runs(reader, check), [] if good is None else _runs(reader, good)
+        now = [_loaded(reader, run, check.machine) for run in runs]
+        then = [_loaded(reader, run, check.machine) for run in before]
+        pictures = [_picture(one, next((o for o in then if not incomparable_reason(one, o)), None), good, k) for k, one in enumerate(now)]
+    except AbbeError as error:
+        return [], [], error.detail
+    except MALFORMED as error:  # another version wrote the document, or it was edited
+        return [], [], f"{type(error).__name__}: {error}"
+    return runs, pictures, ""
+
+
+def _runs(reader: Reader, check: Verification) -> list[RunRecord]:
+    """The complete runs of a check, as far as they are stored."""
+    if not check.campaign or not check.runs:
+        return []
+    try:
+        campaign = reader.store.campaigns.find(check.campaign)
+    except NotStored:
+        return []
+    labels = set(check.runs)
+    return [run for run in reader.store.runs.all(campaign.id) if run.label in labels and run.visible_status == "complete"]
+
+
+def _loaded(reader: Reader, record: RunRecord, machine: str) -> LoadedRun:
+    run = with_earliest_mounting([load_run(reader.store, record.id)])[0]
+    return LoadedRun(record.label, machine, run, run_data(run), ())
+
+
+def _picture(one: LoadedRun, before: LoadedRun | None, good: Verification | None, k: int) -> Markup:
+    frame = current()
+    title = frame.translate("check.curve", test=frame.state("test", one.run.test), label=one.label)
+    named = [] if before is None or good is None else [(frame.translate("check.before", n=good.id), curve(before))]
+    return Markup(_overlay([*named, (frame.translate("check.now"), curve(one))], title, f"curve-{k}"))  # noqa: S704 - our own writer
+
+
+def _overlay(curves: Sequence[tuple[str, ComparedCurve]], title: str, key: str) -> str:
+    error, place = current().drawn(), current().drawn("mm")
+    shown = [(name, c, thinned(c.deviation_um)) for name, c in curves]
+    if curves[0][1].round:
+        traces = [PolarTrace(name, c.x[at], c.deviation_um[at]) for name, c, at in shown]
+        return polar_plot(traces, key=key, heading=title, unit=error)
+    lines = [(name, c.x[at] / place.size, c.deviation_um[at]) for name, c, at in shown]
+    frame = current()
+    labels = frame.translate("compare.along", unit=place.sign), frame.translate("compare.deviation", unit=error.sign)
+    return overlay_plot(lines, key=key, heading=title, labels=labels, unit=error)

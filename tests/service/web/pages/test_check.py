@@ -1,0 +1,47 @@
+"""The screen of one check by HTTP: what it says of the machine, its figures, the last good check, and where it leads."""
+
+from __future__ import annotations
+
+import re
+
+from tests.pages_world import Served, as_user
+
+
+def text(page: str) -> str:
+    """What a person reads on a screen."""
+    return re.sub(r"\s+", " ", re.sub(r"<[^>]*>", " ", page.partition("<main")[2]))
+
+
+def test_a_failed_check_has_its_figures_curves_alarm_and_report(running: Served) -> None:
+    with as_user(running, "olga") as client:
+        page = client.get("/check?id=24").text
+        shown = text(page)
+        assert "✖ fail Above the limit by more than U (k = 2): Body diagonal." in shown
+        assert "Body diagonal 21.6 ± 1.1 µm · Limit 20 µm · ✖ fail" in shown
+        assert "Change since check 20: +3.4 ± 1.6 µm" in shown
+        assert page.count('class="gauge"') == 3
+        assert re.search(r'aria-label="Body diagonal: 21.6 ± 1.1 µm, limit 20 µm"', page)
+        both = re.findall(r"<svg[^>]*>.*?</svg>", page.partition('class="curves"')[2], re.DOTALL)
+        assert len(both) >= 4
+        assert all("check 20" in one and "this check" in one for one in both), "each curve stands over that of the last good check"
+        assert 'href="/alarm?id=2"' in page
+        report = re.search(r'href="(/api/v1/reports/verification/24)"', page)
+        assert report is not None
+        assert client.get(report[1]).content.startswith(b"%PDF")
+
+
+def test_a_check_that_could_not_be_completed_says_why_and_what_to_do(running: Served) -> None:
+    with as_user(running, "olga", **{"Accept-Language": "ja"}) as client:
+        shown = text(client.get("/check?id=22").text)
+        assert "点検は完了しませんでした。" in shown
+        assert "is the laser on?" in shown
+        assert "測定データが保存されていません" in shown
+        assert client.get("/check?id=999").status_code == 404
+        assert 'href="/check?id=24"' in client.get("/").text
+
+
+def test_every_mention_of_a_check_leads_to_it(running: Served) -> None:
+    with as_user(running, "olga") as client:
+        for path in ("/", "/alarm?id=2"):
+            assert 'href="/check?id=24"' in client.get(path).text, path
+        assert 'data-href="/check?id=24"' in client.get("/trends").text
