@@ -48,6 +48,21 @@ def polynomial(rng: Rng, length_mm: float, size: float) -> Curve:
     return lambda x: legendre.legval(2.0 * x / length_mm - 1.0, c)
 
 
+def fading(rng: Rng, length_mm: float, size: float) -> Curve:
+    """Legendre polynomials of orders 2 to 9 that fade as order to the power of -1.5, and nothing above."""
+    k = np.arange(2, 10)
+    c = np.array([0.0, 0.0, *(size * rng.standard_normal(k.size) / (k / 2.0) ** 1.5)])
+    return lambda x: legendre.legval(2.0 * x / length_mm - 1.0, c)
+
+
+def stepped(rng: Rng, length_mm: float, size: float) -> Curve:
+    """A smooth shape, and jumps where segments of 40 to 120 mm of a scale or a rail meet."""
+    base = smooth(rng, length_mm, 0.6 * size)
+    ends = np.cumsum(rng.uniform(40.0, 120.0, int(length_mm / 40.0)))
+    levels = 0.6 * size * rng.standard_normal(ends.size + 1)
+    return lambda x: base(x) + levels[np.searchsorted(ends, x)]
+
+
 def kinked(rng: Rng, length_mm: float, size: float) -> Curve:
     """A little smooth shape, kinks, and cusps where rails are joined."""
     base = smooth(rng, length_mm, 0.4 * size)

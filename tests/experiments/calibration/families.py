@@ -1,4 +1,4 @@
-"""Families of machines: the fifteen of the practice set, and one of curves that somebody measured."""
+"""Families of machines: the fifteen of the practice set, one of curves that somebody measured, and three that nobody else has."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -60,6 +60,15 @@ FAMILIES: dict[str, Family] = {
     "fourier": Family(curves.bumpy, Sizes(25.0, 5.0, (2.5, 2.5, 4.0))),
     "walk": Family(curves.walking, Sizes(20.0, 8.0, (1.5, 1.3, 2.6))),
     "pitch": Family(waves_um=((2.0, 10.0), (1.0, 40.0 / 3.0))),
+    "series": Family(curves.fading, Sizes(25.0, 13.0, (3.5, 3.0, 8.0))),
+    "step": Family(curves.stepped, Sizes(25.0, 10.0, (3.0, 2.0, 4.0))),
+    "mixed": Family(
+        curves.walking,
+        Sizes(25.0, 10.0, (0.6, 0.6, 1.2)),
+        waves_um=((1.2, 5.0), (0.8, 16.0)),
+        play=True,
+        noise=lambda n: replace(n, outliers=0.01),
+    ),
     "measured": Family(foreign, Sizes(25.0, 10.0, (3.0, 2.2, 4.5))),
 }
 
