@@ -121,7 +121,7 @@ class Rows:
             if found is None:
                 raise self.file.wrong(heading, "the row of headings is empty, or the file is shorter")
             return [cell.strip() for cell in found]
-        return [str(k + 1) for k in range(max((len(cells) for _, cells in self.rows), default=0))]
+        return [str(k + 1) for k in range(len(self.rows[0][1]))]
 
 
 def column_file(path: Path) -> ColumnFile:
@@ -215,6 +215,9 @@ def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
     body = [(line, cells) for line, cells in table.rows if line > columns.heading]
     if len(body) < 2:
         raise table.file.wrong(table.rows[-1][0], f"{len(body)} rows of readings, expected two or more")
+    for line, cells in body:
+        if len(cells) > len(headings) and any(cell.strip() for cell in cells[len(headings) :]):
+            raise table.file.wrong(line, f"{len(cells)} cells under {len(headings)} headings: are decimals or the delimiter commas?")
     lines = [line for line, _ in body]
     target = _column(table, headings, body, columns, "target")
     unit = LENGTHS[columns.target.unit]

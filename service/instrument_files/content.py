@@ -100,7 +100,7 @@ def digest(data: bytes) -> str:
 
 
 def text_file(name: str, data: bytes) -> TextFile:
-    """Decode a text file: UTF-8, UTF-16 with its mark, GB 2312 if all its bytes above 127 are pairs of it, else Latin-1.
+    """Decode a text file: UTF-8, UTF-16 with its mark, GB 2312 if all bytes above 127 are pairs of usual signs, else Latin-1.
 
     Raises
     ------
@@ -123,9 +123,12 @@ def _decoded(data: bytes) -> str:
     except UnicodeDecodeError:
         pass
     try:
-        return data.decode("gb2312")
+        text = data.decode("gb2312")
     except UnicodeDecodeError:
         return data.decode("latin-1")
+    pairs = re.findall(rb"[\x80-\xff]{2}", data)
+    usual = sum(b"\xb0" <= pair[:1] <= b"\xd7" for pair in pairs)  # level 1: signs that are often used
+    return text if 2 * usual >= len(pairs) else data.decode("latin-1")
 
 
 def step_of(words: list[str], unit: float) -> float:

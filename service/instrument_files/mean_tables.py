@@ -13,6 +13,7 @@ from abbe.service.instrument_files.answers import LENGTHS
 from abbe.service.instrument_files.content import AxisReadings, Content, axis_of, digest, step_of, text_file
 
 _POS_HEAD = re.compile(r"Position\s+(Bidirectional|Forward Directional|Reverse Directional|Backward Directional) Avg Error", re.ASCII)
+_OTHER_HEAD = re.compile(r"\s*Position\s+[A-Z]", re.ASCII)
 _WAYS = {"Bidirectional": 0.0, "Forward Directional": 1.0, "Reverse Directional": -1.0, "Backward Directional": -1.0}
 _REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined", re.ASCII)
 _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", "compensation end": "end"}
@@ -66,6 +67,8 @@ def _pos_tables(file: TextFile) -> tuple[dict[float, Table], dict[str, str], int
             if way in tables:
                 raise file.wrong(line, f"a second table of {head.group(1)} means")
             now = tables.setdefault(way, ([], [], [], []))
+        elif _OTHER_HEAD.match(text):
+            raise file.wrong(line, f"{text.strip()[:60]!r} is no table that is known", "send the file to the people who write Abbe")
         elif now is not None and text.strip():
             _row(file, line, text, now)
         elif now is None and ":" in text:

@@ -21,6 +21,7 @@ KINDS = {"rtl": ("linear", "length", 1e-3), "rta": ("angular", "angle", 1e-3)}
 """File type: its owner, the quantity of its deviations, and their unit in mm or rad."""
 ONE_WAY, BOTH_WAYS = ("0", "1", "2", "0"), ("0", "0", "2", "0")
 """First four words of ``Flags``."""
+LARGEST_MRAD = 100.0
 MOST = 20_000
 """Targets, and runs: more than any test has."""
 _SECTION = re.compile(r"([A-Z][A-Z -]*)::")
@@ -50,14 +51,15 @@ def read_renishaw(name: str, data: bytes) -> Content:
     """
     file = text_file(name, data)
     parts = _sections(file)
-    head = _facts(parts.lines["HEADER"])
+    head = _facts(file, parts.lines["HEADER"])
     _, quantity, unit = _kind(parts, head)
     targets, both = _targets(parts)
     rows, words = _rows(parts, targets.size, _run_count(parts, both=both))
     notes = [f"section {one} (line {at}) is not known and was not read" for one, at in parts.at.items() if one not in _READ]
+    _check_size(file, rows, quantity, float(np.ptp(targets)) / unit)
     rows, dropped = _readings(parts, rows, targets.size, both=both)
     notes += [dropped] if dropped else []
-    user = _facts(parts.lines.get("USER-TEXT", []))
+    user = _facts(file, parts.lines.get("USER-TEXT", []))
     further, read, odd = _environment(parts, axis_of(user.get("axis", "")), len(rows))
     position = np.array([targets[t] for _, _, t, _ in rows])
     rising = 1.0 if targets[-1] > targets[0] else -1.0
@@ -106,10 +108,16 @@ def _sections(file: TextFile) -> _Sections:
     return out
 
 
-def _facts(lines: Lines) -> dict[str, str]:
+def _facts(file: TextFile, lines: Lines) -> dict[str, str]:
     """Names in small letters, and their values."""
-    pairs = (text.partition(":") for _, text in lines)
-    return {" ".join(name.split()).lower(): value.strip() for name, colon, value in pairs if colon}
+    out = dict[str, str]()
+    for line, text in lines:
+        name, colon, value = text.partition(":")
+        key = " ".join(name.split()).lower()
+        if out.get(key, value.strip()) != value.strip():
+            raise file.wrong(line, f"a second {name.strip()[:40]}: {out[key]!r} before, {value.strip()[:40]!r} here")
+        out |= {key: value.strip()} if colon else {}
+    return out
 
 
 def _kind(parts: _Sections, head: Mapping[str, str]) -> tuple[str, str, float]:
@@ -200,6 +208,14 @@ def _rows(parts: _Sections, targets: int, runs: int) -> tuple[list[Row], list[st
     return out, words
 
 
+def _check_size(file: TextFile, rows: list[Row], quantity: str, travel: float) -> None:
+    most = travel if quantity == "length" else LARGEST_MRAD
+    for line, *_, value in rows:
+        if abs(value) > most:
+            unit = "µm, more than the targets are apart" if quantity == "length" else "mrad, more than a guide can turn"
+            raise file.wrong(line, f"the deviation is {value:g} {unit}")
+
+
 def _readings(parts: _Sections, rows: list[Row], targets: int, *, both: bool) -> tuple[list[Row], str]:
     """The rows that are readings, and a note on those that are not: one writer fills the way back of a one-way test with zeros."""
     wrong = [k for k in range(0, len(rows), targets) if (rows[k][1] > 0) != (not both or (k // targets) % 2 == 0)]
@@ -222,6 +238,8 @@ def _environment(parts: _Sections, axis: str, n: int) -> tuple[dict[str, F1], di
     for line, text in parts.lines.get("ENVIRONMENT", []):
         name, _, rest = text.partition(":")
         key = " ".join(name.split())
+        if key in said:
+            raise parts.file.wrong(line, f"a second {key[:40]}")
         said[key] = " ".join(rest.replace('"', " ").split())
         taken = _TAKEN.get(key.lower())
         if taken is None:

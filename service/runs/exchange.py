@@ -143,10 +143,11 @@ def store_folder(store: Store, content: Folder) -> int:
     return store.runs.import_campaign((named, machine), (campaign["campaign"], doc), imported, content.tables)
 
 
-def export_folder(store: Store, name_or_id: str | int, target: Path, images: Images = no_image) -> Path:
+def export_folder(store: Store, name_or_id: str | int, target: Path, images: Images = no_image, *, csv: bool = False) -> Path:
     """Write a campaign as the folder ``target``, completely or not at all, and return the folder.
 
-    ``images`` returns the image of a table by its CRC; the folder gets those that acted during the runs.
+    ``images`` returns the image of a table by its CRC; the folder gets those that acted during the runs. ``csv``: also write the columns of
+    each run as CSV, their units in the headings.
 
     Raises
     ------
@@ -166,7 +167,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path, images: Ima
         raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a writable folder") from None
     try:
         aside.chmod(0o755)  # mkdtemp creates private folders; other users may read an export
-        _write_folder(store, record, runs, aside, images)
+        _write_folder(store, record, runs, aside, images, csv=csv)
         if target.exists():
             target.rmdir()
         aside.rename(target)
@@ -177,7 +178,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path, images: Ima
     return target
 
 
-def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path, images: Images) -> None:
+def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path, images: Images, *, csv: bool) -> None:
     entries, setups, written = [], dict[str, Doc](), list[Run]()
     joined = {piece.run for run in runs if run.status == COMPLETE for piece in run.start.pieces}
     for run in runs:
@@ -193,7 +194,10 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
                 f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe, or is damaged: restore a backup"
             )
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
-        _write_json(folder / entry["file"], run_document(read, run, chunks))
+        document = run_document(read, run, chunks)
+        _write_json(folder / entry["file"], document)
+        if csv:
+            _write_csv((folder / entry["file"]).with_suffix(".csv"), document["columns"])
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
     for crc in _acting(written):
         if (image := images(crc)) is not None:
@@ -230,5 +234,15 @@ def _safe(label: str) -> str:
 def _write_json(path: Path, document: Doc) -> None:
     with path.open("w", encoding="utf-8", newline="\n") as file:
         json.dump(document, file, ensure_ascii=False, allow_nan=False)
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def _write_csv(path: Path, columns: Doc) -> None:
+    """Columns of a run with all digits; a sealed column is left out."""
+    known = {name: values for name, values in columns.items() if values is not None}
+    rows = [",".join(known), *(",".join(map(repr, row)) for row in zip(*known.values(), strict=True))]
+    with path.open("w", encoding="utf-8", newline="") as file:
+        file.write("\n".join([*rows, ""]))
         file.flush()
         os.fsync(file.fileno())

@@ -161,6 +161,7 @@ def _statistics(key: str, values: list[float] | None) -> tuple[str, ...]:
 def export_campaign(
     campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Name or number of the campaign.", show_default=False)],
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="New folder.", show_default=False)],
+    csv: Annotated[bool, typer.Option("--csv", help="Also the columns of each run as CSV, their units in the headings.")] = False,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -170,7 +171,7 @@ def export_campaign(
     from abbe.service.tables.measured_with import images_of
 
     with open_store(database_url(db, machine)) as store:
-        written = export_folder(store, campaign, folder, images_of(store))
+        written = export_folder(store, campaign, folder, images_of(store), csv=csv)
         count = len(store.runs.all(store.campaigns.find(campaign).id))
     text = f"exported campaign {campaign!r} with {count} runs to {written}"
     answer({"campaign": campaign, "runs": count, "folder": str(written)}, text, as_json=as_json)

@@ -16,7 +16,10 @@ Found = dict[str, Any] | None
 
 
 def text_of(data: bytes) -> str | None:
-    for encoding in ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else ("utf-8-sig", "gb2312", "latin-1"):
+    pairs = re.findall(b"[\x80-\xff][\x80-\xff]", data)
+    chinese = sum(0xB0 <= pair[0] <= 0xD7 for pair in pairs) * 2 >= len(pairs)
+    usual = ("utf-8-sig", "gb2312", "latin-1") if chinese else ("utf-8-sig", "latin-1")
+    for encoding in ("utf-16",) if data[:2] in (b"\xff\xfe", b"\xfe\xff") else usual:
         try:
             text = data.decode(encoding)
         except UnicodeDecodeError:
@@ -48,6 +51,33 @@ def pairs(text: str) -> dict[str, str]:
     return {re.sub(r"\s+", " ", key.strip()).lower(): value.strip() for key, value in found}
 
 
+def contradicts(text: str) -> bool:
+    """Whether one name has two values."""
+    found = {
+        (re.sub(r"\s+", " ", a.strip()).lower(), b.strip()) for a, _, b in (line.partition(":") for line in text.split("\n") if ":" in line)
+    }
+    return len({name for name, _ in found}) < len(found)
+
+
+def environment(text: str, axis: str) -> dict[str, list[float]] | None:
+    """Start and end of each temperature (°C) and of the pressure (Pa) that can be; material is the mean of its sensors."""
+    values = {re.sub(r"\s+", " ", a.strip()).lower(): numbers(b.split()) for a, _, b in (line.partition(":") for line in text.split("\n"))}
+    wanted = {name: values[name] for name in ("air temp", "air press", "mat temp 1", "mat temp 2", "mat temp 3") if name in values}
+    if any(found is None or not 1 <= len(found) <= 3 for found in wanted.values()):
+        return None
+    used = {}
+    for name, found in wanted.items():
+        low, high = (600, 1100) if name == "air press" else (-20, 50)
+        if found and any(found) and all(low <= one <= high for one in found):
+            used[name] = [found[0], found[-1]]
+    material = [ends for name, ends in used.items() if name.startswith("mat")]
+    out = {"temp_air_C": used["air temp"]} if "air temp" in used else {}
+    out |= {"pressure_air_Pa": [100 * one for one in used["air press"]]} if "air press" in used else {}
+    if material and axis:
+        out[f"temp_{axis.lower()}_C"] = [sum(ends) / len(material) for ends in zip(*material, strict=True)]
+    return out
+
+
 def rtl(data: bytes) -> Found:  # noqa: C901 - one rule of the format a line
     text = text_of(data)
     if text is None:
@@ -61,6 +91,11 @@ def rtl(data: bytes) -> Found:  # noqa: C901 - one rule of the format a line
     if not {"TARGET DATA", "RUNS", "DEVIATIONS", "EOF"} <= set(part) or names[-1] != "EOF" or part["EOF"].strip():
         return None
     head, user = pairs(part["HEADER"]), pairs(part.get("USER-TEXT", ""))
+    if any(contradicts(part.get(name, "")) for name in ("HEADER", "USER-TEXT")):
+        return None
+    said = [line.split(":", 1)[0].split() for line in part.get("ENVIRONMENT", "").split("\n") if line]
+    if any(said.count(name) > 1 for name in said):
+        return None
     kind = head.get("file type", "").lower()
     if (kind, head.get("owner", "").lower()) not in (("rtl", "linear"), ("rta", "angular")):
         return None
@@ -82,6 +117,12 @@ def rtl(data: bytes) -> Found:  # noqa: C901 - one rule of the format a line
         return None
     if not all(re.fullmatch("[0-9]{1,9}", line[0]) and re.fullmatch("[0-9]{1,9}", line[1]) for line in lines):
         return None
+    around = environment(part.get("ENVIRONMENT", ""), letter(user.get("axis", "")))
+    if around is None:
+        return None
+    most = max(targets) - min(targets) if kind == "rtl" else 0.1
+    if any(abs(value) * 1e-3 > most for value in values):
+        return None
     order = [(int(line[0]), int(line[1])) for line in lines]
     out = range(1, len(targets) + 1)
     zigzag = [(run, t) for run in range(1, runs + 1) for t in (out if run % 2 else reversed(out))]
@@ -100,6 +141,7 @@ def rtl(data: bytes) -> Found:  # noqa: C901 - one rule of the format a line
     return {
         "axis": letter(user.get("axis", "")),
         "machine": user.get("machine", ""),
+        "further": around,
         "position": [targets[order[k][1] - 1] for k in chosen],
         "direction": [sign * (1 if zigzag is straight or order[k][0] % 2 else -1) for k in chosen],
         "deviation": [values[k] * unit for k in chosen],
@@ -275,6 +317,8 @@ def csv(data: bytes) -> Found:
     cells = [
         {name: row[head.index(name)].strip() for name in ("Target", "Reading", "Dir", "Air") if head.index(name) < len(row)} for row in rows
     ]
+    if any("".join(row[len(head) :]).strip() for row in rows):
+        return None
     if len(rows) < 2 or any(len(row) != 4 or "." in row["Target"] + row["Reading"] + row["Air"] for row in cells):
         return None
     columns = {name: numbers([row[name].replace(",", ".") for row in cells]) for name in ("Target", "Reading", "Air")}

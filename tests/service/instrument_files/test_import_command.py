@@ -167,6 +167,20 @@ def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:
     assert figures(report(abbe, "t"))["E"][0] == pytest.approx(14.0)
 
 
+def test_readings_written_as_csv_are_read_again(abbe: Abbe) -> None:
+    abbe("import", "x.rtl", "--yes")
+    assert abbe("export", "x", "folder", "--csv").code == 0
+    assert Path("folder/r01.csv").read_text().splitlines()[:2] == [
+        "t_s,x_mm,y_mm,z_mm,feed_mm_min,direction,deviation_mm",
+        "0.0,0.0,0.0,0.0,0.0,1,0.0",
+    ]
+    columns = 'axis = "X"\n[target]\ncolumn = "x_mm"\nunit = "mm"\n[deviation]\ncolumn = "deviation_mm"\nunit = "mm"\n'
+    Path("c.toml").write_text(columns + '[direction]\ncolumn = "direction"\nplus = "1"\nminus = "-1"\n')
+    assert abbe("import", "folder/r01.csv", "--yes", "--columns", "c.toml", "--name", "again").code == 0
+    first, again = figures(report(abbe, "x")), figures(report(abbe, "again"))
+    assert {name: value for name, (value, _) in first.items()} == {name: value for name, (value, _) in again.items()}
+
+
 def test_a_laser_file_becomes_a_certificate_and_a_file_for_statistics(abbe: Abbe) -> None:
     issuer = '[issuer]\nlaboratory = "Plant 2"\ncity = "Bonn"\ncountry = "DE"\nperson = "A. B."\n'
     Path("mill.toml").write_text(MACHINE_FILE + issuer)

@@ -69,6 +69,8 @@ def test_what_is_wrong_in_a_pos(folder: Folder) -> None:
     assert folder.refused("y.pos", POS.replace("0.0000\t0.0030", "0.0000")).startswith("y.pos:14: 1 values, expected a position and a mean")
     assert folder.refused("y.pos", POS.replace("200.0000\t-0.0080", "50\t-0.008")).startswith("y.pos:16: position 50 after 100")
     assert folder.refused("y.pos", "hello\n").startswith("y.pos:1: no table")
+    other = POS.replace("Reverse Directional Avg Error", "Forward Sigma")
+    assert folder.refused("y.pos", other).startswith("y.pos:13: 'Position   \\tForward Sigma' is no table that is known")
 
 
 def test_a_compensation_report_says_its_unit_or_is_asked(folder: Folder) -> None:
@@ -167,6 +169,7 @@ def test_without_a_column_of_the_direction_the_order_decides(folder: Folder) -> 
     assert folder.refused("t.csv", again, columns).startswith("t.csv:7: target 200 mm three times in a row")
 
 
+COLUMNS_BY_COMMA = COLUMNS.replace("heading = 2", "heading = 1")[: COLUMNS.index("[air")]
 WRONG = {
     "comma or point": (TABLE.replace("99,9950", "99.9950"), "", "t.csv:4: '99.9950' has a point, but the decimal sign is a comma"),
     "not a number": (TABLE.replace("99,9950", "err"), "", "t.csv:4: measured is 'err', expected a number"),
@@ -174,6 +177,7 @@ WRONG = {
     "another word": (TABLE.replace("99,9975;-", "99,9975;back"), "", "t.csv:7: the direction is 'back', expected '+' or '-'"),
     "no such column": (TABLE.replace("Target", "Soll"), "", "t.csv:2: no column 'Target'; headings are Soll, Reading, Dir, Air"),
     "twice the heading": (TABLE.replace("Air", "Target"), "", "t.csv:2: two columns 'Target'"),
+    "commas": ("Target,Reading,Dir\n0,0,0,+\n100,0,99,+\n", COLUMNS_BY_COMMA, "t.csv:2: 4 cells under 3 headings: are decimals or the"),
     "Fahrenheit": (TABLE.replace("20,5", "68,9"), "", "t.csv:3: air temperature is 68.9, expected -20 to 50: is the unit C?"),
     "unit": (
         TABLE,

@@ -75,9 +75,7 @@ def test_angles_are_milliradian() -> None:
     np.testing.assert_allclose(test.deviation, [1e-6, 2e-6, 4e-6, 4e-6, 3e-6, 1e-6])
 
 
-@pytest.mark.parametrize(
-    ("encoding", "name"), [("utf-8", "Fräse 1"), ("utf-16", "Fräse 1"), ("latin-1", "Fräse 1"), ("gbk", "立式加工中心")]
-)
+@pytest.mark.parametrize(("encoding", "name"), [("utf-8", "Fräse 1"), ("utf-16", "Fräse 1"), ("latin-1", "Größe 1"), ("gbk", "立式镗床")])
 def test_names_in_the_encodings_that_occur(encoding: str, name: str) -> None:
     assert read(renishaw(user=f"Machine:{name}\nAxis:X").encode(encoding)).machine == name
 
@@ -102,6 +100,8 @@ WRONG = {
     "another kind": (GOOD.replace(": rtl", ": rts"), "x.rtl:1: the file type is 'rts', expected rtl or rta"),
     "kind and owner differ": (GOOD.replace(": Linear", ": Angular"), "x.rtl:1: the owner is 'Angular', expected 'linear' in a .rtl"),
     "section twice": (GOOD + "RUNS::\nRun-count:4\n", "x.rtl:41: a second section RUNS:: (the first is in line 22)"),
+    "two axes": (GOOD.replace("By:a", "Axis:Y"), "x.rtl:18: a second Axis: 'Y' before, 'X' here"),
+    "another unit": (GOOD.replace("-11.0", "-1100000.0", 1), "x.rtl:29: the deviation is -1.1e+06 µm, more than the targets are apart"),
     "no section": ("hello\n", "x.rtl:1: 'hello' is outside of every section"),
     "binary": (GOOD.replace("VMC-1", "VMC\0"), "x.rtl:14: it holds the character '\\x00'"),
 }

@@ -123,6 +123,9 @@ def same(content: Content, other: dict[str, Any]) -> bool:
     test = content.test
     if test is None or test.axis != other["axis"] or content.unit_known != other.get("unit_known", True):
         return False
+    further, wanted = {name: values[[0, -1]] for name, values in test.further.items()}, other.get("further")
+    if wanted is not None and (further.keys() != wanted.keys() or not all(np.allclose(further[name], wanted[name]) for name in wanted)):
+        return False
     return (
         test.position_mm.tolist() == other["position"]
         and test.direction.tolist() == other["direction"]
