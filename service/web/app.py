@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Sequence
+from collections.abc import Awaitable, Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 
@@ -26,7 +26,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.api.tables import add_table_orders, add_tables
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.document import SecurityHeaders, complete
-from abbe.service.web.error_pages import add_core_unavailable
+from abbe.service.web.error_pages import ErrorPages, add_core_unavailable
 from abbe.service.web.frame import FrameMiddleware
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.live import add_live
@@ -88,10 +88,13 @@ class Application(FastAPI):
     """FastAPI with the security headers outermost, so that every response has them, even that to an unhandled error."""
 
     behind_tls = False
+    status: Callable[[], Awaitable[Status]] | None = None
 
     def build_middleware_stack(self) -> ASGIApp:
         """Return the middleware stack, wrapped in the security headers."""
-        return SecurityHeaders(super().build_middleware_stack(), behind_tls=self.behind_tls)
+        stack = super().build_middleware_stack()
+        shown = ErrorPages(stack, environment(), self.status) if self.status is not None else stack
+        return SecurityHeaders(shown, behind_tls=self.behind_tls)
 
     def openapi(self) -> dict[str, Any]:
         """Return the OpenAPI document, including the responses of the middleware."""
@@ -130,6 +133,7 @@ def create_app(
     # FastAPI's /docs loads scripts from a CDN, which plants cannot reach.
     app = Application(title="Abbe", version=version, docs_url=None, redoc_url=None, openapi_url=None)
     app.behind_tls = auth is not None and auth.behind_tls
+    app.status = source.status
     problems.install(app)
     add_core_unavailable(app, environment())
     _add_routes(app, source)

@@ -5,12 +5,21 @@ While the core is silent, people get a screen that says so: old values are never
 
 from __future__ import annotations
 
+import json
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
 from jinja2 import Environment
+from starlette.requests import HTTPConnection
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.errors import CoreSilent
-from abbe.service.web.problems import problem_of
+from abbe.service.errors import AbbeError, CoreSilent
+from abbe.service.queries.status import Status
+from abbe.service.users.roles import Permission
+from abbe.service.web.frame import current, frame_for
+from abbe.service.web.problems import MEDIA_TYPE, problem_of
 from abbe.service.web.strip import strip_of
 
 RETRY_S = "5"
@@ -34,3 +43,51 @@ def for_people(request: Request) -> bool:
     """Whether the request is for a screen. The home page always is: its script fetches it without an Accept header."""
     path = request.url.path
     return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))
+
+
+class ErrorPages:
+    """Shows a problem document to people as a screen: whatever refuses a request, a browser's address bar gets no JSON.
+
+    Pure ASGI, outside of everything that refuses. ``status``: source of the status bar.
+    """
+
+    def __init__(self, app: ASGIApp, env: Environment, status: Callable[[], Awaitable[Status]]) -> None:
+        self._app, self._env, self._status = app, env, status
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Pass the request on; replace a problem document by a screen."""
+        if scope["type"] != "http" or scope["path"].startswith("/api/") or not _reads_html(scope):
+            await self._app(scope, receive, send)
+            return
+        start: list[Message] = []
+        body: list[bytes] = []
+
+        async def replaced(message: Message) -> None:
+            if message["type"] == "http.response.start" and (b"content-type", MEDIA_TYPE.encode()) in message["headers"]:
+                start.append(message)
+            elif not start:
+                await send(message)
+            else:
+                body.append(message.get("body", b""))
+                if not message.get("more_body", False):
+                    await self._page(scope, start[0], json.loads(b"".join(body)))(scope, receive, send)
+
+        await self._app(scope, receive, replaced)
+
+    def _page(self, scope: Scope, start: Message, problem: dict[str, str]) -> ASGIApp:
+        kept = {k.decode(): v.decode() for k, v in start["headers"] if k not in {b"content-type", b"content-length"}}
+
+        async def answer(_: Scope, receive: Receive, send: Send) -> None:
+            request, now = HTTPConnection(scope), None
+            with frame_for(request):
+                if current().may(Permission.READ):
+                    with suppress(AbbeError):
+                        now = await self._status()
+                page = self._env.get_template("error.html").render(problem=problem, bar=strip_of(now))
+            await HTMLResponse(page, int(start["status"]), kept)(scope, receive, send)
+
+        return answer
+
+
+def _reads_html(scope: Scope) -> bool:
+    return any(name == b"accept" and b"text/html" in value for name, value in scope["headers"])

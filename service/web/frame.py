@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from contextvars import ContextVar
 from dataclasses import dataclass
 from typing import Any
@@ -162,19 +163,36 @@ class FrameMiddleware:
         request = HTTPConnection(scope)
         if self._paths is None and self._routes:
             self._paths = frozenset(str(getattr(route, "path", "")) for route in self._routes)
-        chosen_now = {name: value for name in CHOICES if (value := request.query_params.get(name, "")) in CHOICES[name][1]}
-        stored = {name: value for name, (cookie, allowed) in CHOICES.items() if (value := request.cookies.get(cookie, "")) in allowed}
-        chosen = {"lang": language.preferred(request.headers.get("accept-language", "")), "theme": THEMES[0], "units": units.METRIC}
-        chosen |= stored | chosen_now
-        query = tuple((k, v) for k, v in request.query_params.multi_items() if k != "lang")
-        visit = scope.get("state", {}).get("visit")
-        token = _NOW.set(Frame(chosen["lang"], scope["path"], query, visit, chosen["theme"], chosen["units"], self._paths))
+        chosen_now, frame = _frame_of(request, self._paths)
+        token = _NOW.set(frame)
         try:
             keep = chosen_now if scope["method"] == "GET" else {}
             secure = is_tls(request, behind_tls=self._behind_tls)
             await self._app(scope, receive, _remembering(send, keep, secure=secure) if keep else send)
         finally:
             _NOW.reset(token)
+
+
+def _frame_of(request: HTTPConnection, paths: frozenset[str] | None) -> tuple[dict[str, str], Frame]:
+    """The options that a request chooses, and its frame."""
+    chosen_now = {name: value for name in CHOICES if (value := request.query_params.get(name, "")) in CHOICES[name][1]}
+    stored = {name: value for name, (cookie, allowed) in CHOICES.items() if (value := request.cookies.get(cookie, "")) in allowed}
+    chosen = {"lang": language.preferred(request.headers.get("accept-language", "")), "theme": THEMES[0], "units": units.METRIC}
+    chosen |= stored | chosen_now
+    query = tuple((k, v) for k, v in request.query_params.multi_items() if k != "lang")
+    visit = request.scope.get("state", {}).get("visit")
+    path = request.scope["path"]
+    return chosen_now, Frame(chosen["lang"], path, query, visit, chosen["theme"], chosen["units"], paths)
+
+
+@contextmanager
+def frame_for(request: HTTPConnection) -> Iterator[None]:
+    """Set the frame of a request that is answered outside of `FrameMiddleware`."""
+    token = _NOW.set(_frame_of(request, None)[1])
+    try:
+        yield
+    finally:
+        _NOW.reset(token)
 
 
 def _remembering(send: Send, chosen: Mapping[str, str], *, secure: bool) -> Send:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hmac
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import structlog
@@ -67,11 +68,14 @@ class AuthMiddleware:
             await _answer(problem(429, "too many requests from this address", headers={"Retry-After": "1"}), scope, receive, send)
             return
         route = route_of(self._routes, scope)
-        if route is None:  # the router distinguishes unknown paths from unknown methods
-            await self._app(scope, receive, send)
-            return
         visit = Visit(ANONYMOUS, address)
         scope.setdefault("state", {})["visit"] = visit
+        if route is None:  # the router distinguishes unknown paths from unknown methods
+            if _reads_html(request):  # the screen with the error has the visitor's Stop
+                with suppress(AbbeError):
+                    await self._identify(request, visit, Permission.READ, used=False)
+            await self._app(scope, receive, send)
+            return
         changes = scope["type"] == "http" and scope["method"] in MUTATING
         body = Body(scope, receive, route) if changes else None
         try:
@@ -90,15 +94,9 @@ class AuthMiddleware:
         if need is None:
             return problem(403, "this route declares no permission")
         changes = body is not None
-        bearer = _bearer(request)
-        tls = is_tls(request, behind_tls=self._behind_tls)
-        secret = None if self._auth is None else request.cookies.get(self._auth.cookie(tls=tls))
-        if need is not PUBLIC or (changes and secret):
+        if need is not PUBLIC or (changes and self._secret(request)):
             used = changes or in_use(request.url.path, request.headers.get(ACTIVE_HEADER))
-            visit.principal = LOCAL_VIEWER
-            if self._auth is not None:
-                visit.principal = await self._auth.who(bearer, secret, in_use=used, to_stop=need is Permission.STOP)
-        visit.secret = (secret or "") if visit.principal.by == "session" else ""
+            await self._identify(request, visit, need, used=used)
         if need is not PUBLIC and (unknown := _unknown(request, visit.principal, changes=changes)) is not None:
             return unknown
         if body is not None and (too_long := await body.refusal()) is not None:
@@ -108,6 +106,18 @@ class AuthMiddleware:
         if changes or request.scope["type"] == "websocket":
             return self._foreign(request, visit, need, changes=changes)
         return None
+
+    def _secret(self, request: HTTPConnection) -> str:
+        tls = is_tls(request, behind_tls=self._behind_tls)
+        return "" if self._auth is None else request.cookies.get(self._auth.cookie(tls=tls), "")
+
+    async def _identify(self, request: HTTPConnection, visit: Visit, need: Need, *, used: bool) -> None:
+        """Find out who visits; ``used``: the request counts as use of the session."""
+        secret = self._secret(request)
+        visit.principal = LOCAL_VIEWER
+        if self._auth is not None:
+            visit.principal = await self._auth.who(_bearer(request), secret, in_use=used, to_stop=need is Permission.STOP)
+        visit.secret = secret if visit.principal.by == "session" else ""
 
     def _foreign(self, request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
         """Refuse a request from another site's page. Browsers always send an origin; a program with a token has no cookie to misuse."""
@@ -200,10 +210,14 @@ class _Log:
 def _unknown(request: HTTPConnection, principal: Principal, *, changes: bool) -> Response | None:
     # Without users everybody may look; a change needs a known user.
     if principal is ANONYMOUS or (changes and principal.by == "nobody"):
-        if "text/html" in request.headers.get("accept", "") and not changes and request.scope["type"] == "http":
+        if _reads_html(request) and not changes and request.scope["type"] == "http":
             return RedirectResponse("/login", 303)
         return problem(401, "log in, or send a token", headers={"WWW-Authenticate": "Bearer"})
     return None
+
+
+def _reads_html(request: HTTPConnection) -> bool:
+    return "text/html" in request.headers.get("accept", "")
 
 
 def _bearer(request: HTTPConnection) -> str | None:

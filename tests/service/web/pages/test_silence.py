@@ -47,3 +47,21 @@ async def test_every_screen_says_so_and_the_api_gives_a_problem(running: Served)
                 "application/problem+json",
                 "SRV-002",
             )
+
+
+async def test_people_get_errors_as_screens_with_stop_and_programs_get_problems(running: Served) -> None:
+    wrong = {"/nosuch": 404, "/run?id=abc": 422, "/audit": 403, "/run?id=99": 404, "/diagnostics/nothing": 404}
+    with as_user(running, "olga", Accept="text/html", **{"Accept-Language": "de"}) as client:
+        for path, status in wrong.items():
+            answer = client.get(path)
+            assert (answer.status_code, answer.headers["content-type"]) == (status, "text/html; charset=utf-8"), path
+            assert 'id="stop"' in answer.text, path
+            assert '<html lang="de"' in answer.text, path
+            assert answer.headers["content-security-policy"].startswith("default-src 'self'")
+        assert "Ihre Rolle darf das nicht" in client.get("/audit").text
+        assert client.get("/api/v1/nosuch").json()["code"] == "WEB-404"
+    with as_user(running, "olga") as program:
+        assert program.get("/nosuch").json()["code"] == "WEB-404"
+    async with httpx.AsyncClient(base_url=running.base, headers={"Accept": "text/html"}) as stranger:
+        page = (await stranger.get("/nosuch")).text
+        assert running.filled.machine not in page, "who is not logged in learns nothing of the machine"
