@@ -187,7 +187,7 @@ class AxisUncertainties(Section):
 
 
 class Material(Section):
-    """Thermal expansion, to reduce figures of ISO 230-2 to 20 °C. Without a coefficient and a temperature nothing is reduced."""
+    """Thermal expansion, to reduce figures of ISO 230-2 and 230-6 to 20 °C. Without a coefficient and a temperature nothing is reduced."""
 
     scale_per_k: AxisCoefficients = Field(
         default=AxisCoefficients(),
@@ -207,12 +207,20 @@ class Material(Section):
         description="coefficient to which the laser's own compensation of material expansion is set, at the same temperature, 1/K; 0: it "
         "is off, the laser reads true length",
     )
+    workpiece_per_k: Coefficient | None = Field(
+        default=None,
+        description="expansion coefficient of the workpieces, 1/K: reports then also show what a part, made as warm as the scales, has at "
+        "20 °C",
+    )
+    u_workpiece_per_k: CoefficientUncertainty | None = Field(default=None, description="its standard uncertainty, 1/K")
 
     @model_validator(mode="after")
     def _known(self) -> Self:
         for axis in "XYZ":
             if (getattr(self.scale_per_k, axis) is None) != (getattr(self.u_scale_per_k, axis) is None):
                 raise ValueError(f"scale_per_k.{axis} and u_scale_per_k.{axis} belong together, expected both or neither")
+        if (self.workpiece_per_k is None) != (self.u_workpiece_per_k is None):
+            raise ValueError("workpiece_per_k and u_workpiece_per_k belong together, expected both or neither")
         return self
 
     def by_axis(self) -> dict[str, AxisMaterial]:
@@ -224,6 +232,8 @@ class Material(Section):
                 self.temperature_c,
                 self.u_temperature_k,
                 self.laser_per_k,
+                self.workpiece_per_k,
+                self.u_workpiece_per_k,
             )
             for axis in "XYZ"
         }

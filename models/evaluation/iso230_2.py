@@ -52,15 +52,13 @@ class Approaches:
 class ScaleBudget:
     """Standard uncertainties that the repeats do not show.
 
-    ``per_length``: of the length scale, mm per mm (wavelength, expansion of the scales); ``reading_mm``: of the mean at each position,
-    independent from position to position (resolution, drift of the environment); ``slope``: of a slope of all deviations, mm per mm, in
-    place of ``per_length`` where the temperature of the scale is known. ``per_length`` counts only between the two positions that decide a
-    figure, and is nothing where they coincide; for ``slope`` each figure is evaluated again with the deviations tilted.
+    ``slope``: of a slope of all deviations, mm per mm (wavelength, temperature and expansion of the scales): each figure is evaluated again
+    with the deviations tilted by it, so that a flat axis, too, is not known better than its slope. ``reading_mm``: of the mean at each
+    position, independent from position to position (resolution, drift of the environment).
     """
 
-    per_length: float = 0.0
-    reading_mm: float = 0.0
     slope: float = 0.0
+    reading_mm: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -191,11 +189,10 @@ def _of_s(side: _Side) -> F1:
 
 
 def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
-    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes, of the length scale and of the slope."""
+    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes and of the slope."""
     hi, lo = int(np.argmax(upper)), int(np.argmin(lower))
-    scale = np.hypot(budget.per_length * abs(at[hi] - at[lo]), _tilt(at, upper, lower, budget))
     apart = float(np.hypot(u[hi], u[lo])) if hi != lo else 0.0
-    return Value(float(upper[hi] - lower[lo]), float(np.hypot(apart, scale)))
+    return Value(float(upper[hi] - lower[lo]), float(np.hypot(apart, _tilt(at, upper, lower, budget))))
 
 
 def _tilt(at: F1, upper: F1, lower: F1, budget: ScaleBudget) -> float:

@@ -28,7 +28,9 @@ class Diagonals:
     missing: tuple[str, ...]
 
 
-def diagonals(readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, budget: ScaleBudget | None = None) -> Diagonals:
+def diagonals(
+    readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, budgets: Mapping[str, ScaleBudget] | None = None
+) -> Diagonals:
     """Evaluate the diagonals of a volume or a plane.
 
     Parameters
@@ -37,6 +39,8 @@ def diagonals(readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, 
         By name, a letter per axis: ``p`` grows along the diagonal, ``n`` falls. Positions are distances along the diagonal.
     wanted : iterable of str
         Names that the standard asks for: `BODY` or `FACE`.
+    budgets : mapping of str to ScaleBudget, optional
+        Of every diagonal; without it the uncertainties contain only the scatter of the cycles.
 
     Raises
     ------
@@ -49,7 +53,7 @@ def diagonals(readings: Mapping[str, Approaches], wanted: Iterable[str] = BODY, 
         raise ValueError(
             f"ISO 230-6: diagonal {strange[0]!r} is not one of {sorted(names)}" if strange else "ISO 230-6: no diagonal was given"
         )
-    each = {name: positioning(readings[name], budget) for name in sorted(readings)}
+    each = {name: positioning(readings[name], (budgets or {}).get(name)) for name in sorted(readings)}
     repeats = {name: p.R for name, p in each.items() if p.R is not None}
     return Diagonals(
         each,

@@ -9,11 +9,15 @@ scale of coefficient a moves the axis by (1 + a (t - 20)) for each commanded mm.
 own compensation of material expansion is on, it has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L what its own
 sensor of material temperature read. Scale at T, stated t = T + e and t_L = T + e_L: measured was a (T - 20) - b (T + e_L - 20), taken off
 is (a - b) (T + e - 20), and -(a - b) e - b e_L is left. The errors e and e_L are independent and have the same u(t).
+
+A workpiece of coefficient w is as warm as the scale when it is made, and shrinks when it cools down: for dimensions at 20 °C of such parts,
+w (t - 20) is taken off in place of a (t - 20). Along a diagonal every axis counts with the square of its share of the direction.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
 
@@ -21,6 +25,25 @@ from abbe.models.evaluation.iso230_2 import Approaches
 
 REFERENCE_C = 20.0
 """Reference temperature of length, ISO 1."""
+
+
+class Strain(Protocol):
+    """What the temperature added to deviations along a line, mm per mm of travel, and its standard uncertainties (`Expansion`)."""
+
+    @property
+    def strain(self) -> float:
+        """What was added."""
+        ...
+
+    @property
+    def u_as_measured(self) -> float:
+        """Standard uncertainty of what was added, at exactly the stated temperature."""
+        ...
+
+    @property
+    def u_reduced(self) -> float:
+        """Standard uncertainty of the reduction."""
+        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +100,38 @@ class Expansion:
         return float(np.hypot(self.u_as_measured, self.rise_k * self.u_scale_per_k))
 
 
-def reduced(readings: Approaches, expansion: Expansion) -> Approaches:
+@dataclass(frozen=True, slots=True)
+class DiagonalExpansion:
+    """Expansion along a diagonal: of its axes, each with the square of its direction cosine.
+
+    ``axes``: in order; ``shares``: squared direction cosines, which sum to 1. The laser is one and the same. Errors of the scales'
+    temperatures are independent; errors of their coefficients add up, since scales of one make have one coefficient.
+    """
+
+    axes: tuple[Expansion, ...]
+    shares: tuple[float, ...]
+
+    @property
+    def strain(self) -> float:
+        """What the temperature added to the deviation, mm per mm of travel along the diagonal."""
+        return sum(share * one.strain for one, share in zip(self.axes, self.shares, strict=True))
+
+    @property
+    def u_as_measured(self) -> float:
+        """Standard uncertainty of the deviation as measured, mm per mm: of each scale's temperature, and of the laser's own sensor."""
+        scales = [
+            share * (one.scale_per_k - one.laser_per_k) * one.u_temperature_k for one, share in zip(self.axes, self.shares, strict=True)
+        ]
+        return float(np.linalg.norm([*scales, max(one.laser_per_k * one.u_temperature_k for one in self.axes)]))
+
+    @property
+    def u_reduced(self) -> float:
+        """Standard uncertainty of the reduction, mm per mm of travel along the diagonal (ISO/TR 16015, first order)."""
+        coefficients = sum(share * abs(one.rise_k) * one.u_scale_per_k for one, share in zip(self.axes, self.shares, strict=True))
+        return float(np.hypot(self.u_as_measured, coefficients))
+
+
+def reduced(readings: Approaches, expansion: Strain) -> Approaches:
     """Return the same approaches with deviations as at 20 °C.
 
     Deviation at 20 °C = deviation as measured - (scale - laser) (t - 20) (position - first position). Both directions and all cycles of a
@@ -87,8 +141,8 @@ def reduced(readings: Approaches, expansion: Expansion) -> Approaches:
     ----------
     readings : Approaches
         As measured, mm.
-    expansion : Expansion
-        One temperature for the whole test.
+    expansion : Strain
+        Of an axis or a diagonal; one temperature of each scale for the whole test.
     """
     taken_off = (expansion.strain * (readings.position_mm - readings.position_mm[0]))[:, None]
     return replace(readings, forward_mm=readings.forward_mm - taken_off, backward_mm=readings.backward_mm - taken_off)

@@ -184,7 +184,7 @@ def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:
     if solution_id is None:
         return {}
     runs = [load_run(store, number) for number in store.solutions.get(solution_id).run_ids]
-    return {"Table holds at": holds_at(runs, rules.materials) or "unknown: no temperature of the scales is on record or stated"}
+    return {"Table holds at": holds_at(runs, rules.materials)}
 
 
 def _verdict(journal: Sequence[PushEntry], known: PushFacts) -> tuple[Sign, str, str]:

@@ -11,8 +11,7 @@ import numpy as np
 
 from abbe.models.evaluation.iso230_2 import Positioning, ScaleBudget, Value, positioning
 from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circular
-from abbe.models.evaluation.iso230_6 import BODY, FACE, diagonals
-from abbe.models.evaluation.reduction import reduced
+from abbe.models.evaluation.iso230_6 import BODY, FACE, Diagonals, diagonals
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.domain.material import AxisMaterial
@@ -24,7 +23,16 @@ from abbe.service.rendering.plots.curves import PositioningCurves, positioning_p
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.runs.coverage import not_judged
 from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
-from abbe.service.verification.reduction import AT_20, REDUCTION_STATEMENT, Reduction, budgets, reduction_of
+from abbe.service.verification.reduction import (
+    AT_20,
+    DIAGONAL_AT_20,
+    REDUCTION_STATEMENT,
+    Reduction,
+    Way,
+    diagonal_reduction_of,
+    reduction_of,
+    ways,
+)
 
 UM = 1e3
 POLAR_POINTS = 720
@@ -44,7 +52,7 @@ BAR_STATEMENT = (
 class Evaluated:
     """Results of evaluated runs for a report.
 
-    ``statements`` are part of the uncertainty statement; ``conditions`` tell of each test of ISO 230-2 how it was reduced to 20 °C.
+    ``statements`` are part of the uncertainty statement; ``conditions`` tell of each test how it was reduced to 20 °C.
     """
 
     figures: list[ReportFigure] = field(default_factory=list)
@@ -86,7 +94,8 @@ def evaluate(
         its_runs = [run for run in runs if run.run_id in test.runs]
         _axis(out, test, (budget, known), reduction_of(its_runs, test.name, materials or {}))
     for plane, tests in along.items():
-        _diagonals(out, plane, tests, budget)
+        found = {t.name: diagonal_reduction_of([run for run in runs if run.run_id in t.runs], materials or {}) for t in tests}
+        _diagonals(out, plane, tests, (budget, known), found)
     if linear or along:
         numbers = {"wave": known.u_wavelength * 1e6, "kelvin": known.u_scale_temperature_k, "expansion": known.scale_expansion_per_k * 1e6}
         out.statements.append(LASER_STATEMENT.format(**numbers))
@@ -111,7 +120,7 @@ def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:
 
 
 def _axis(out: Evaluated, test: AxisTest, budget: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> None:
-    found = _as_measured_and_at_20(out, test, budget, reduction)
+    found = _axis_ways(out, test, budget, reduction)
     runs = ", ".join(test.runs)
     if found.lowest != found.most:
         out.remarks.append(f"axis {test.name} ({runs}): positions have {found.lowest} to {found.most} approaches from one side")
@@ -120,26 +129,32 @@ def _axis(out: Evaluated, test: AxisTest, budget: tuple[ScaleBudget, StatedInput
         out.not_observable.append(f"repeatability and accuracy of axis {test.name}: every position was approached once from each side")
 
 
-def _as_measured_and_at_20(out: Evaluated, test: AxisTest, stated: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> Positioning:
-    """Add the figures as measured and, where the temperature is known, those at 20 °C before them; return those as measured."""
+def _axis_ways(out: Evaluated, test: AxisTest, stated: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> Positioning:
+    """Add the figures of every way to evaluate a test; return those of the first."""
     budget, known = stated
-    group, label, x_label = f"Axis {test.name}, set-up {test.setup}", f"{test.name} {test.setup}", f"position of {test.name} in mm"
-    out.conditions[f"{AT_20}, axis {label}"] = reduction.text
-    if reduction.expansion is None or reduction.temperature is None:
-        found = positioning(test.readings, budget)
-        out.figures += [_figure(f"{group}: positioning, ISO 230-2", *row, "ISO 230-2") for row in positioning_rows(found)]
-        out.pictures.append(_positioning(label, x_label, found))
+    label = f"{test.name} {test.setup}"
+    _tell(out, f"{AT_20}, axis {label}", reduction)
+    if reduction.expansion is None:
         out.remarks.append(f"axis {test.name} ({', '.join(test.runs)}): {reduction.text}")
-        return found
-    measured, at_20 = budgets(budget, reduction.expansion, known.u_wavelength)
-    found, result = positioning(test.readings, measured), positioning(reduced(test.readings, reduction.expansion), at_20)
-    out.figures += [_figure(f"{group}: positioning at 20 °C, ISO 230-2", *row, "ISO 230-2, at 20 °C") for row in positioning_rows(result)]
-    as_read = f"{group}: positioning as measured at {reduction.temperature.text}"
-    out.figures += [_figure(as_read, *row, "ISO 230-2, as measured") for row in positioning_rows(found)]
-    out.pictures += [_positioning(f"{label} at 20 °C", x_label, result), _positioning(f"{label} as measured", x_label, found)]
-    if REDUCTION_STATEMENT not in out.statements:
+    found = []
+    for way in ways(budget, reduction, "ISO 230-2", known.u_wavelength):
+        one = positioning(way.of(test.readings), way.budget)
+        group = f"Axis {test.name}, set-up {test.setup}: positioning{way.text}"
+        out.figures += [_figure(group, *row, way.method) for row in positioning_rows(one)]
+        out.pictures.append(_positioning(f"{label}{_short(way)}", f"position of {test.name} in mm", one))
+        found.append(one)
+    return found[0]
+
+
+def _tell(out: Evaluated, test: str, reduction: Reduction) -> None:
+    out.conditions[test] = reduction.text
+    if reduction.expansion is not None and REDUCTION_STATEMENT not in out.statements:
         out.statements.append(REDUCTION_STATEMENT)
-    return found
+
+
+def _short(way: Way) -> str:
+    """How a picture's title names a way; empty for a test that is not reduced."""
+    return way.method.partition(", ")[2] and f" {way.method.partition(', ')[2]}"
 
 
 def positioning_rows(p: Positioning) -> list[tuple[str, str, Value | None]]:
@@ -175,22 +190,42 @@ def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
     return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=text)], "wide")
 
 
-def _diagonals(out: Evaluated, plane: str, tests: list[AxisTest], budget: ScaleBudget) -> None:
-    found = diagonals({t.name: t.readings for t in tests}, BODY if plane == "body" else FACE, budget)
+def _diagonals(
+    out: Evaluated, plane: str, tests: list[AxisTest], stated: tuple[ScaleBudget, StatedInputs], reductions: Mapping[str, Reduction]
+) -> None:
+    """Add the figures of diagonals, by ``reductions`` of each by name: all of them are reduced, or none."""
     what = "Body diagonals" if plane == "body" else f"Face diagonals {plane}"
-    group = f"{what}: ISO 230-6"
+    for name, one in reductions.items():
+        _tell(out, f"{DIAGONAL_AT_20}, diagonal {name}", one)
+    unreduced = next((one for one in reductions.values() if one.expansion is None), None)
+    if unreduced is not None:
+        reductions = dict.fromkeys(reductions, unreduced)
+        out.remarks.append(f"{what.lower()}: {unreduced.text}")
+    budget, known = stated
+    each = {name: ways(budget, one, "ISO 230-6", known.u_wavelength) for name, one in reductions.items()}
+    names, found = [t.name for t in tests], []
+    for same in zip(*(each[name] for name in names), strict=True):
+        readings = {t.name: way.of(t.readings) for t, way in zip(tests, same, strict=True)}
+        budgets = {name: way.budget for name, way in zip(names, same, strict=True)}
+        found.append(diagonals(readings, BODY if plane == "body" else FACE, budgets))
+        _diagonal_figures(out, f"{what}: displacement{same[0].text}", same[0], found[-1])
+    result = found[0]
+    if result.missing:
+        out.not_observable.append(f"{what}: {', '.join(result.missing)} not measured, so the figures are lower bounds")
+    first = next(iter(result.each.values()))
+    notes = (note for one in reductions.values() for note in one.notes)
+    out.remarks += [f"{what.lower()}: {note}" for note in dict.fromkeys((*first.departures(), *tests[0].notes, *notes))]
+
+
+def _diagonal_figures(out: Evaluated, group: str, way: Way, found: Diagonals) -> None:
     rows = [
         ("E_d", "systematic deviation, both directions, of diagonal {}", found.E_d),
         ("M_d", "range of the mean bidirectional deviations, of diagonal {}", found.M_d),
         ("B_d", "reversal, of diagonal {}", found.B_d),
     ] + ([("R_d", "repeatability, of diagonal {}", found.R_d)] if found.R_d is not None else [])
-    out.figures += [_figure(group, symbol, text.format(name), value, "ISO 230-6") for symbol, text, (name, value) in rows]
-    out.figures += [_figure(group, f"E {n}", f"systematic deviation of diagonal {n}", p.E, "ISO 230-6") for n, p in found.each.items()]
-    out.pictures += [_positioning(f"diagonal {n}", "along the diagonal in mm", p) for n, p in found.each.items()]
-    if found.missing:
-        out.not_observable.append(f"{what}: {', '.join(found.missing)} not measured, so the figures are lower bounds")
-    first = next(iter(found.each.values()))
-    out.remarks += [f"{what.lower()}: {note}" for note in dict.fromkeys((*first.departures(), *tests[0].notes))]
+    out.figures += [_figure(group, symbol, text.format(name), value, way.method) for symbol, text, (name, value) in rows]
+    out.figures += [_figure(group, f"E {n}", f"systematic deviation of diagonal {n}", p.E, way.method) for n, p in found.each.items()]
+    out.pictures += [_positioning(f"diagonal {n}{_short(way)}", "along the diagonal in mm", p) for n, p in found.each.items()]
 
 
 def _circles(out: Evaluated, tests: list[CircleTest]) -> None:

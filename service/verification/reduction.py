@@ -1,15 +1,15 @@
-"""From which temperature an axis test is reduced to 20 °C, by the runs' sensors and the machine file, or why it is not."""
+"""From which temperature a test of an axis or a diagonal is reduced to 20 °C, by the runs' sensors and the machine file, or why not."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.evaluation.iso230_2 import ScaleBudget
-from abbe.models.evaluation.reduction import Expansion
+from abbe.models.evaluation.iso230_2 import Approaches, ScaleBudget
+from abbe.models.evaluation.reduction import DiagonalExpansion, Expansion, Strain, reduced
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.service.config_schema import COLDEST_C, WARMEST_C
@@ -20,15 +20,17 @@ from abbe.service.rendering.numbers import plain, tidy, with_uncertainty
 PER_UM = 1e6
 AIR_APART_K = 2.0
 """By how much air and scale may differ before the report says so."""
-AT_20 = "ISO 230-2 at 20 °C"
-"""Begins the name of the condition that tells how a test was reduced."""
+AT_20, DIAGONAL_AT_20 = "ISO 230-2 at 20 °C", "ISO 230-6 at 20 °C"
+"""Begin the name of the condition that tells how a test was reduced."""
 REDUCTION_STATEMENT = (
-    "Reduction to 20 °C (ISO 230-2, nominal differential expansion): deviation as measured - (scale - laser) (t - 20 °C) travel, where the "
-    "laser's coefficient is that of its own compensation of material, 0 if it is off. U of the figures as measured includes the "
-    "uncertainty of t, and the same of the laser's own sensor if its compensation is on; U of the reduced ones also that of the scale's "
-    "coefficient (ISO/TR 16015). Each figure is evaluated again with the deviations tilted by plus and minus this uncertainty. The reduced "
-    "figures are the result by the standard."
+    "Reduction to 20 °C (ISO 230-2 and 230-6, nominal differential expansion): deviation as measured - (scale - laser) (t - 20 °C) travel, "
+    "where the laser's coefficient is that of its own compensation of material, 0 if it is off; on a diagonal each axis counts with the "
+    "square of its share of the direction. U of the figures as measured includes the uncertainty of t, and the same of the laser's own "
+    "sensor if its compensation is on; U of the reduced ones also that of the scale's coefficient (ISO/TR 16015). Each figure is evaluated "
+    "again with the deviations tilted by plus and minus this uncertainty. The reduced figures are the result by the standard. Figures of a "
+    "workpiece have its coefficient in place of the scale's: what parts made as warm as the scales have at 20 °C."
 )
+UNKNOWN = "unknown: no temperature of the scales is on record or stated"
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,12 +49,32 @@ class ScaleTemperature:
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """How a test is reduced. ``expansion``: None if it is not; ``text``: what was used, or why it is not reduced; ``notes``: on its t."""
+    """How a test is reduced.
 
-    temperature: ScaleTemperature | None
-    expansion: Expansion | None
+    ``expansion``: None if it is not; ``workpiece``: of the workpieces, None without a coefficient; ``at``: temperature of the scales as
+    text; ``of_workpiece``: coefficient as text; ``text``: what was used, or why it is not reduced; ``notes``: on its temperature.
+    """
+
+    expansion: Strain | None
     text: str
     notes: tuple[str, ...] = ()
+    at: str = ""
+    workpiece: Strain | None = None
+    of_workpiece: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Way:
+    """One evaluation of a test: how it is called, the uncertainty that repeats do not show, and what is taken off before."""
+
+    text: str
+    method: str
+    budget: ScaleBudget
+    taken_off: Strain | None = None
+
+    def of(self, readings: Approaches) -> Approaches:
+        """The readings of the test, evaluated this way."""
+        return readings if self.taken_off is None else reduced(readings, self.taken_off)
 
 
 def scale_temperature(runs: Sequence[Run], axis: str, material: AxisMaterial | None) -> ScaleTemperature | None:
@@ -73,13 +95,13 @@ def scale_temperature(runs: Sequence[Run], axis: str, material: AxisMaterial | N
 
 
 def holds_at(runs: Sequence[Run], materials: Mapping[str, AxisMaterial]) -> str:
-    """At which temperature of the scales what these runs showed holds, e.g. ``"X 24.00 ± 0.40 °C"``; empty if none is known."""
+    """At which temperature of the scales what these runs showed holds, e.g. ``"X 24.00 ± 0.40 °C"``; `UNKNOWN` if none is known."""
     out = []
     for axis in AXES:
         at, bad = scale_temperature(runs, axis, materials.get(axis)), _out_of_bounds(runs, axis)
         if at is not None or bad:
             out.append(f"{axis} unknown ({bad})" if at is None else f"{axis} {at.text} ({at.origin})")
-    return ", ".join(out)
+    return ", ".join(out) or UNKNOWN
 
 
 def _pm(value: float, u: float) -> str:
@@ -138,22 +160,73 @@ def reduction_of(runs: Sequence[Run], axis: str, materials: Mapping[str, AxisMat
     material = materials.get(axis)
     bad = _out_of_bounds(runs, axis)
     if bad:
-        return Reduction(None, None, f"not reduced to 20 °C: {bad}")
+        return Reduction(None, f"not reduced to 20 °C: {bad}")
     at = scale_temperature(runs, axis, material)
     notes = _notes(runs, axis, at, material)
-    holds = "" if at is None else f"; the figures hold at {at.text} ({at.origin})"
     if at is None:
-        return Reduction(None, None, "not reduced to 20 °C: no material temperature", notes)
+        return Reduction(None, "not reduced to 20 °C: no material temperature", notes)
     if material is None or material.scale_per_k is None or material.u_scale_per_k is None:
-        return Reduction(at, None, f"not reduced to 20 °C: no expansion coefficient of the scale{holds}", notes)
+        holds = f"the figures hold at {at.text} ({at.origin})"
+        return Reduction(None, f"not reduced to 20 °C: no expansion coefficient of the scale; {holds}", notes)
     expansion = Expansion(material.scale_per_k, material.u_scale_per_k, at.value_c, at.u_k, material.laser_per_k)
-    scale = _pm(expansion.scale_per_k * PER_UM, expansion.u_scale_per_k * PER_UM)
     laser = "off" if not expansion.laser_per_k else f"{plain(expansion.laser_per_k * PER_UM)} µm/m/K"
-    text = f"reduced from {at.text} ({at.origin}) with {scale} µm/m/K of the scale; the laser's compensation of material: {laser}"
-    return Reduction(at, expansion, f"{text}. The reduced figures are the result", notes)
+    text = (
+        f"reduced from {at.text} ({at.origin}) with {_coefficient(expansion)} of the scale; the laser's compensation of material: {laser}"
+    )
+    found = Reduction(expansion, f"{text}. The reduced figures are the result", notes, at.text)
+    if material.workpiece_per_k is None or material.u_workpiece_per_k is None:
+        return found
+    workpiece = replace(expansion, scale_per_k=material.workpiece_per_k, u_scale_per_k=material.u_workpiece_per_k)
+    return replace(found, workpiece=workpiece, of_workpiece=_coefficient(workpiece))
 
 
-def budgets(budget: ScaleBudget, expansion: Expansion, u_wavelength: float) -> tuple[ScaleBudget, ScaleBudget]:
-    """Uncertainty that repeats do not show: of the figures as measured, and of the reduced ones; ``u_wavelength``: relative."""
-    one, other = (float(np.hypot(u_wavelength, u)) for u in (expansion.u_as_measured, expansion.u_reduced))
-    return ScaleBudget(0.0, budget.reading_mm, one), ScaleBudget(0.0, budget.reading_mm, other)
+def diagonal_reduction_of(runs: Sequence[Run], materials: Mapping[str, AxisMaterial]) -> Reduction:
+    """Decide whether and how the test along a diagonal in these runs is reduced: as its axes are, or not at all."""
+    way = runs[0].laser.span_mm
+    shares = {axis: float(share) for axis, share in zip(AXES, way**2 / (way @ way), strict=True) if share > 0.0}
+    each = {axis: reduction_of(runs, axis, materials) for axis in shares}
+    notes = tuple(dict.fromkeys(note for one in each.values() for note in one.notes))
+    why = [f"{axis}: {one.text}" for axis, one in each.items() if one.expansion is None]
+    if why:
+        return Reduction(None, f"not reduced to 20 °C: {why[0].replace(': not reduced to 20 °C', '')}", notes)
+    at = ", ".join(f"{axis} {one.at}" for axis, one in each.items())
+    text = "; ".join(f"{axis} {one.text}" for axis, one in each.items())
+    of_axes = [one.workpiece for one in each.values()]
+    return Reduction(
+        _combined([one.expansion for one in each.values()], shares),
+        text,
+        notes,
+        at,
+        None if None in of_axes else _combined(of_axes, shares),
+        next(iter(each.values())).of_workpiece,
+    )
+
+
+def _combined(axes: Sequence[Strain | None], shares: Mapping[str, float]) -> DiagonalExpansion:
+    return DiagonalExpansion(tuple(one for one in axes if isinstance(one, Expansion)), tuple(shares.values()))
+
+
+def _coefficient(expansion: Expansion) -> str:
+    return f"{_pm(expansion.scale_per_k * PER_UM, expansion.u_scale_per_k * PER_UM)} µm/m/K"
+
+
+def ways(budget: ScaleBudget, reduction: Reduction, standard: str, u_wavelength: float) -> list[Way]:
+    """The evaluations of a test, the result first: at 20 °C, as measured, and for the workpieces; or only as it is, if not reduced.
+
+    ``budget``: of a test that is not reduced; ``u_wavelength``: relative standard uncertainty of the laser's wavelength.
+    """
+    if reduction.expansion is None:
+        return [Way(f", {standard}", standard, budget)]
+
+    def sure(u: float) -> ScaleBudget:
+        return ScaleBudget(float(np.hypot(u_wavelength, u)), budget.reading_mm)
+
+    one, part = reduction.expansion, reduction.workpiece
+    found = [
+        Way(f" at 20 °C, {standard}", f"{standard}, at 20 °C", sure(one.u_reduced), one),
+        Way(f" as measured at {reduction.at}", f"{standard}, as measured", sure(one.u_as_measured)),
+    ]
+    if part is not None:
+        text = f" at 20 °C of a workpiece with {reduction.of_workpiece}"
+        found.append(Way(text, f"{standard}, of a workpiece at 20 °C", sure(part.u_reduced), part))
+    return found

@@ -58,15 +58,15 @@ def report(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
 
-    The machine file gives database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2 is reduced to
-    20 °C. Nothing is measured or computed again; the same data give the same bytes. A digital calibration certificate (.xml) needs
-    [issuer] in the machine file and is not signed.
+    The machine file gives database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2 and 230-6 are
+    reduced to 20 °C. Nothing is measured or computed again; the same data give the same bytes. A digital calibration certificate (.xml)
+    needs [issuer] in the machine file and is not signed.
     """
     from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
     from abbe.service.report.report import NUMBERED, certified, rules_of
-    from abbe.service.verification.reduction import AT_20
+    from abbe.service.verification.reduction import AT_20, DIAGONAL_AT_20
 
     for target in out or []:
         form_of(target)  # refuse a wrong suffix before the work
@@ -81,7 +81,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     for target in targets:
         write_document(document, target)
     _, word, text = document.verdict or ("", "", "")
-    reduced = [f"{name}: {told}." for name, told in document.conditions.items() if name.startswith(AT_20)]
+    reduced = [f"{name}: {told}." for name, told in document.conditions.items() if name.startswith((AT_20, DIAGONAL_AT_20))]
     doc = {"files": [str(target) for target in targets], "title": document.title, "verdict": word, "text": text}
     lines = [*(f"report: {target}" for target in targets), f"{document.title}: {word}. {text}".strip(), *reduced]
     answer(doc, *lines, as_json=as_json)

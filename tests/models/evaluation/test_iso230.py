@@ -113,7 +113,7 @@ def test_the_stated_uncertainty_is_the_scatter_of_repeated_tests(n, m):
 
 def test_the_scale_counts_by_the_length_between_the_places_that_decide():
     f = np.array([[0.0, 0.0], [0.010, 0.010], [0.002, 0.002]])
-    p = positioning(approaches(f, f, [0.0, 400.0, 900.0]), ScaleBudget(per_length=1e-6))
+    p = positioning(approaches(f, f, [0.0, 400.0, 900.0]), ScaleBudget(slope=1e-6))
     assert p.E.u_mm == pytest.approx(400e-6)
     assert p.B.u_mm == 0.0
 
