@@ -60,7 +60,9 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     tests = [settled(content, answers) for content in contents]
     traces = [_standing(content.trace, answers) for content in contents if content.trace is not None]
     linear = [test for test in tests if test is not None and _is_run(test)]
-    made = machine or _assumed_machine(contents, [test for test in tests if test is not None])
+    measured = [(test.axis, test.position_mm) for test in tests if test is not None]
+    measured += [(axis, columns[f"{axis.lower()}_mm"]) for columns, axis in traces]
+    made = machine or _assumed_machine(contents, measured)
     runs, entries, setups, start = list[Doc](), list[Doc](), dict[str, Doc](), 0.0
     for columns, axis in [*((_columns(test), test.axis) for test in linear), *traces]:
         run = _run(name, len(runs) + 1, made, axis, {k: v + start if k == "t_s" else v for k, v in columns.items()})
@@ -102,11 +104,13 @@ def _is_run(test: AxisReadings) -> bool:
     return test.quantity == "length" and bool((test.direction != 0.0).all())
 
 
-def _assumed_machine(contents: Sequence[Content], tests: Sequence[AxisReadings]) -> Doc:
+def _assumed_machine(contents: Sequence[Content], measured: Sequence[tuple[str, F1]]) -> Doc:
     stroke = {axis: [-1.0, 1.0] for axis in AXES}
-    for test in tests:
-        ends = [*test.position_mm, *(stroke[test.axis] if stroke[test.axis] != [-1.0, 1.0] else ())]
-        stroke[test.axis] = [float(min(ends)), float(max(ends))]
+    for axis in AXES:
+        places = [value for name, position in measured if name == axis for value in position]
+        if places:
+            low, high = float(min(places)), float(max(places))
+            stroke[axis] = [low, high] if low < high else [low - 1.0, high + 1.0]
     name = next((content.machine for content in contents if content.machine), "unknown machine")
     return {"name": name, "chain": ASSUMED_CHAIN, "vertical_axis": "Z", "stroke_mm": stroke}
 

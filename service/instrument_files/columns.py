@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from abbe.models.arrays import F1
 from abbe.service.config_schema import COLDEST_C, WARMEST_C
-from abbe.service.errors import FileFormatError, expected, location_text
+from abbe.service.errors import AbbeError, FileFormatError, expected, location_text
 from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.answers import ANGLES, LENGTHS
 from abbe.service.instrument_files.content import AxisReadings, Content, axis_of, digest, read_bytes, step_of, text_file
@@ -66,18 +66,22 @@ def toml_of(columns: ColumnFile) -> str:
 class ColumnFile(Part):
     """What the columns of a table are (``abbe-columns/1``, TOML).
 
-    ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. ``heading``: row of the headings, 0
-    for none; rows above it are not read. ``decimal``: the decimal sign of a text file.
+    ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. Without ``target`` the axis stood at
+    ``at_mm``, and ``time``, or ``every_s`` from row to row, says when it was read. ``heading``: row of the headings, 0 for none; rows above
+    it are not read. ``decimal``: the decimal sign of a text file.
     """
 
     format: Literal["abbe-columns/1"] = "abbe-columns/1"
     axis: Literal["X", "Y", "Z"]
-    target: Measured
+    target: Measured | None = None
+    at_mm: float | None = None
     measured: Measured | None = None
     deviation: Measured | None = None
     direction: Direction | None = None
     time: Measured | None = None
+    every_s: float | None = Field(default=None, gt=0.0)
     scale_temperature: Measured | None = None
+    spindle_temperature: Measured | None = None
     air_temperature: Measured | None = None
     air_pressure: Measured | None = None
     heading: int = Field(default=1, ge=0, le=1000)
@@ -89,6 +93,8 @@ class ColumnFile(Part):
     def _possible(self) -> Self:
         if (self.measured is None) == (self.deviation is None):
             raise ValueError("expected either measured (positions) or deviation, got " + ("none" if self.measured is None else "both"))
+        if (self.target is None) != (self.at_mm is not None and (self.time or self.every_s) is not None):
+            raise ValueError("expected either target, or at_mm (where the axis stood) with time or every_s")
         for name, units in _UNITS.items():
             one = getattr(self, name)
             if one is not None and one.unit not in units:
@@ -102,6 +108,7 @@ _UNITS: dict[str, Any] = {
     "deviation": LENGTHS | ANGLES,
     "time": TIMES,
     "scale_temperature": TEMPERATURES,
+    "spindle_temperature": TEMPERATURES,
     "air_temperature": TEMPERATURES,
     "air_pressure": PRESSURES,
 }
@@ -202,6 +209,50 @@ def _text(cell: Any) -> str:
     return repr(cell) if isinstance(cell, float) else str(cell).strip()
 
 
+@dataclass(frozen=True, slots=True)
+class _Body:
+    """The rows of readings of a table, its headings, and what its columns are."""
+
+    table: Rows
+    columns: ColumnFile
+    headings: list[str]
+    rows: list[tuple[int, list[str]]]
+
+    def wrong(self, row: int, what: str) -> AbbeError:
+        """An error about a row of readings, counted from 0."""
+        return self.table.file.wrong(self.rows[row][0], what)
+
+    def index(self, wanted: str | int) -> int:
+        """Place of a column in a row, from 0."""
+        line = self.columns.heading or 1
+        if isinstance(wanted, int):
+            if not 1 <= wanted <= len(self.headings):
+                raise self.table.file.wrong(line, f"there is no column {wanted}, the row has {len(self.headings)}")
+            return wanted - 1
+        if self.headings.count(wanted) != 1:
+            found = "two columns" if wanted in self.headings else "no column"
+            raise self.table.file.wrong(line, f"{found} {wanted!r}; headings are {', '.join(self.headings)[:200]}")
+        return self.headings.index(wanted)
+
+    def numbers(self, name: str) -> tuple[F1, list[str]]:
+        """Values of a column of the column file, in its unit, and their words."""
+        what, k = name.replace("_", " "), self.index(getattr(self.columns, name).column)
+        words = []
+        for row, (_, cells) in enumerate(self.rows):
+            if len(cells) <= k:
+                raise self.wrong(row, f"{len(cells)} cells, {what} is in column {k + 1}")
+            words.append(self._plain(row, cells[k].strip()))
+        values = [self.table.file.number(line, word, what) for (line, _), word in zip(self.rows, words, strict=True)]
+        return np.array(values), words
+
+    def _plain(self, row: int, word: str) -> str:
+        if self.columns.decimal == "." or not self.table.file.text:  # the cells of a workbook are numbers
+            return word
+        if "." in word:
+            raise self.wrong(row, f"{word!r} has a point, but the decimal sign is a comma")
+        return word.replace(",", ".")
+
+
 def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
     """Read a table by its column file.
 
@@ -212,130 +263,113 @@ def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
     """
     table = table_of(name, data, columns.heading, columns.delimiter, columns.sheet)
     headings = table.headings(columns.heading)
-    body = [(line, cells) for line, cells in table.rows if line > columns.heading]
-    if len(body) < 2:
-        raise table.file.wrong(table.rows[-1][0], f"{len(body)} rows of readings, expected two or more")
-    for line, cells in body:
+    body = _Body(table, columns, headings, [(line, cells) for line, cells in table.rows if line > columns.heading])
+    if len(body.rows) < 2:
+        raise table.file.wrong(table.rows[-1][0], f"{len(body.rows)} rows of readings, expected two or more")
+    for row, (_, cells) in enumerate(body.rows):
         if len(cells) > len(headings) and any(cell.strip() for cell in cells[len(headings) :]):
-            raise table.file.wrong(line, f"{len(cells)} cells under {len(headings)} headings: are decimals or the delimiter commas?")
-    lines = [line for line, _ in body]
-    target = _column(table, headings, body, columns, "target")
-    unit = LENGTHS[columns.target.unit]
-    value = _column(table, headings, body, columns, "measured" if columns.measured else "deviation")
-    deviation, resolution, quantity = _deviations(columns, value, target)
-    way, noted = _directions(table.file, headings, body, columns, target[0] * unit, lines)
+            raise body.wrong(row, f"{len(cells)} cells under {len(headings)} headings: are decimals or the delimiter commas?")
+    position, way, noted = _places(body)
+    deviation, resolution, quantity = _deviations(body, position)
     return Content(
         name=name,
         form="table",
         sha256=digest(data),
         machine="",
-        said={"Columns": ", ".join(headings)} | {"Rows": str(len(body))},
+        said={"Columns": ", ".join(headings)} | {"Rows": str(len(body.rows))},
         test=AxisReadings(
             quantity=quantity,
             axis=axis_of(columns.axis),
-            position_mm=target[0] * unit,
+            position_mm=position,
             direction=way,
             deviation=deviation,
             resolution=resolution,
-            t_s=_times(table, headings, body, columns),
-            further=_further(table, headings, body, columns),
+            t_s=_times(body),
+            further=_further(body),
         ),
         notes=(noted,) if noted else (),
     )
 
 
-Body = Sequence[tuple[int, list[str]]]
-Numbers = tuple[F1, list[str]]
+def _places(body: _Body) -> tuple[F1, F1, str]:
+    """Position and direction of each reading, and a note on where they come from."""
+    columns, n = body.columns, len(body.rows)
+    if columns.target is None:
+        at = float(columns.at_mm or 0.0)
+        return np.full(n, at), np.ones(n), f"the axis stood at {at:g} mm: displacements since the first reading"
+    target = body.numbers("target")[0] * LENGTHS[columns.target.unit]
+    if columns.direction is None:
+        return target, _by_order(body, target), "the table has no column of the direction: the order of the targets decided it"
+    return target, _by_words(body, columns.direction), ""
 
 
-def _index(table: Rows, headings: list[str], line: int, wanted: str | int) -> int:
-    if isinstance(wanted, int):
-        if not 1 <= wanted <= len(headings):
-            raise table.file.wrong(line, f"there is no column {wanted}, the row has {len(headings)}")
-        return wanted - 1
-    if headings.count(wanted) != 1:
-        found = "two columns" if wanted in headings else "no column"
-        raise table.file.wrong(line, f"{found} {wanted!r}; headings are {', '.join(headings)[:200]}")
-    return headings.index(wanted)
-
-
-def _column(table: Rows, headings: list[str], body: Body, columns: ColumnFile, name: str) -> Numbers:
-    one: Measured = getattr(columns, name)
-    k = _index(table, headings, columns.heading or 1, one.column)
-    words = []
-    for line, cells in body:
-        if len(cells) <= k:
-            raise table.file.wrong(line, f"{len(cells)} cells, {name.replace('_', ' ')} is in column {k + 1}")
-        words.append(_plain(table.file, line, cells[k], columns.decimal))
-    return np.array([table.file.number(line, w, name.replace("_", " ")) for (line, _), w in zip(body, words, strict=True)]), words
-
-
-def _plain(file: TextFile, line: int, word: str, decimal: str) -> str:
-    word = word.strip()
-    if decimal == "." or not file.text:  # the cells of a workbook are numbers
-        return word
-    if "." in word:
-        raise file.wrong(line, f"{word!r} has a point, but the decimal sign is a comma")
-    return word.replace(",", ".")
-
-
-def _deviations(columns: ColumnFile, value: Numbers, target: Numbers) -> tuple[F1, float, str]:
+def _deviations(body: _Body, position: F1) -> tuple[F1, float, str]:
     """Deviations in mm or rad, their step, and the quantity."""
-    if columns.deviation is not None:
-        unit = (LENGTHS | ANGLES)[columns.deviation.unit]
-        return value[0] * unit, step_of(value[1], unit), "angle" if columns.deviation.unit in ANGLES else "length"
-    assert columns.measured is not None
-    unit = LENGTHS[columns.measured.unit]
-    return value[0] * unit - target[0] * LENGTHS[columns.target.unit], step_of(value[1], unit), "length"
+    name, one = ("deviation", body.columns.deviation) if body.columns.deviation is not None else ("measured", body.columns.measured)
+    assert one is not None
+    value, words = body.numbers(name)
+    unit = (LENGTHS | ANGLES)[one.unit]
+    value = value * unit
+    if body.columns.target is None:
+        value = value - value[0]
+    elif name == "measured":
+        value = value - position
+    return value, step_of(words, unit), "angle" if one.unit in ANGLES else "length"
 
 
-def _directions(file: TextFile, headings: list[str], body: Body, columns: ColumnFile, target: F1, lines: list[int]) -> tuple[F1, str]:
-    """Direction of each approach, and a note on where it comes from."""
-    if columns.direction is not None:
-        k = _index(Rows(file, list(body)), headings, columns.heading or 1, columns.direction.column)
-        words = {columns.direction.plus: 1.0, columns.direction.minus: -1.0}
-        for line, cells in body:
-            if len(cells) <= k or cells[k].strip() not in words:
-                found = cells[k].strip() if len(cells) > k else "missing"
-                raise file.wrong(line, f"the direction is {found!r}, expected {columns.direction.plus!r} or {columns.direction.minus!r}")
-        return np.array([words[cells[k].strip()] for _, cells in body]), ""
+def _by_words(body: _Body, direction: Direction) -> F1:
+    k, words = body.index(direction.column), {direction.plus: 1.0, direction.minus: -1.0}
+    for row, (_, cells) in enumerate(body.rows):
+        if len(cells) <= k or cells[k].strip() not in words:
+            found = cells[k].strip() if len(cells) > k else "missing"
+            raise body.wrong(row, f"the direction is {found!r}, expected {direction.plus!r} or {direction.minus!r}")
+    return np.array([words[cells[k].strip()] for _, cells in body.rows])
+
+
+def _by_order(body: _Body, target: F1) -> F1:
     step = np.sign(np.diff(target))
     for k in range(1, step.size):
         if step[k] == 0.0 == step[k - 1]:
-            raise file.wrong(lines[k + 1], f"target {target[k + 1]:g} mm three times in a row: the order does not say the direction")
+            raise body.wrong(k + 1, f"target {target[k + 1]:g} mm three times in a row: the order does not say the direction")
     if not step.any():
-        raise file.wrong(lines[0], "all targets are the same: the order does not say the direction")
+        raise body.wrong(0, "all targets are the same: the order does not say the direction")
     # The first reading, and the second one at a turning point, belong to the way that follows.
     way = np.concatenate([[0.0], step])
     for k in reversed(range(way.size)):
         if way[k] == 0.0:
             way[k] = way[k + 1] if k + 1 < way.size else -way[k - 1]
-    return way, "the table has no column of the direction: the order of the targets decided it"
+    return way
 
 
-def _times(table: Rows, headings: list[str], body: Body, columns: ColumnFile) -> F1 | None:
-    if columns.time is None:
-        return None
-    t = _column(table, headings, body, columns, "time")[0] * TIMES[columns.time.unit]
+def _times(body: _Body) -> F1 | None:
+    if body.columns.time is None:
+        every = body.columns.every_s
+        return None if every is None else every * np.arange(len(body.rows), dtype=np.float64)
+    t = body.numbers("time")[0] * TIMES[body.columns.time.unit]
     back = np.flatnonzero(np.diff(t) < 0.0)
     if back.size:
-        raise table.file.wrong(body[int(back[0]) + 1][0], "the time goes back")
+        raise body.wrong(int(back[0]) + 1, "the time goes back")
     return t
 
 
-def _further(table: Rows, headings: list[str], body: Body, columns: ColumnFile) -> dict[str, F1]:
-    names = {"scale_temperature": f"temp_{columns.axis.lower()}_C", "air_temperature": "temp_air_C", "air_pressure": "pressure_air_Pa"}
+def _further(body: _Body) -> dict[str, F1]:
+    names = {
+        "scale_temperature": f"temp_{body.columns.axis.lower()}_C",
+        "spindle_temperature": "temp_spindle_C",
+        "air_temperature": "temp_air_C",
+        "air_pressure": "pressure_air_Pa",
+    }
     out = {}
     for name, column in names.items():
-        one: Measured | None = getattr(columns, name)
+        one: Measured | None = getattr(body.columns, name)
         if one is not None:
-            values = _column(table, headings, body, columns, name)[0]
+            values = body.numbers(name)[0]
             values = values + TEMPERATURES[one.unit] if one.unit in TEMPERATURES else values * PRESSURES[one.unit]
             low, high = (COLDEST_C, WARMEST_C) if one.unit in TEMPERATURES else POSSIBLE_PA
             odd = np.flatnonzero((values < low) | (values > high))
             if odd.size:
                 what = f"{name.replace('_', ' ')} is {values[odd[0]]:g}, expected {low:g} to {high:g}: is the unit {one.unit}?"
-                raise table.file.wrong(body[int(odd[0])][0], what)
+                raise body.wrong(int(odd[0]), what)
             out[column] = values
     return out
 

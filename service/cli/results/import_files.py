@@ -149,30 +149,35 @@ def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
 def _columns_asked(path: Path) -> ColumnFile:
     """Ask for heading, axis, columns and units of a table."""
     from abbe.service.instrument_files.answers import ANGLES, LENGTHS
-    from abbe.service.instrument_files.columns import ColumnFile, guesses
+    from abbe.service.instrument_files.columns import TIMES, ColumnFile, guesses
     from abbe.service.instrument_files.registry import headings_of
 
-    heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=1)
+    heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=1, err=True)
     names = headings_of(path, heading)
     guess = dict(guesses(names))
 
-    def column(what: str, key: str) -> str | int:
+    def column(what: str, key: str, units: Sequence[str] = (), usual: str | None = None) -> dict[str, Any]:
         found = _choice(f"column of {what}", names, guess.get(key))
-        return found if heading else int(found)
+        unit = {"unit": _choice("its unit", units, usual)} if units else {}
+        return {"column": found if heading else int(found)} | unit
 
-    axis = _choice("which axis was measured", ("X", "Y", "Z"))
-    target = {"column": column("the targets", "target"), "unit": _choice("its unit", list(LENGTHS), "mm")}
+    doc: dict[str, Any] = {"heading": heading, "axis": _choice("which axis was measured", ("X", "Y", "Z"))}
+    moves = typer.confirm("did it move from target to target (no: it stood still)?", default=True, err=True)
+    if moves:
+        doc["target"] = column("the targets", "target", list(LENGTHS), "mm")
+    else:
+        doc["at_mm"] = typer.prompt("where it stood, mm", type=float, err=True)
+        doc["time"] = column("the time", "time", list(TIMES), "s")
     kind = _choice("readings are", ("deviation", "measured"), "measured" if "measured" in guess else "deviation")
-    value = {
-        "column": column(f"the {kind} values", kind),
-        "unit": _choice("its unit", list(LENGTHS | ANGLES if kind == "deviation" else LENGTHS)),
-    }
-    doc = {"axis": axis, "target": target, kind: value, "heading": heading}
-    if typer.confirm("is there a column of the direction?", default="direction" in guess):
-        way = {"column": column("the direction", "direction")}
-        words = {sign: typer.prompt(f"its word for {sign} of the axis", default=usual) for sign, usual in (("plus", "+"), ("minus", "-"))}
-        doc["direction"] = way | words
+    doc[kind] = column(f"the {kind} values", kind, list(LENGTHS | ANGLES) if kind == "deviation" else list(LENGTHS))
+    if moves and typer.confirm("is there a column of the direction?", default="direction" in guess, err=True):
+        words = {sign: _prompted(f"its word for {sign} of the axis", usual) for sign, usual in (("plus", "+"), ("minus", "-"))}
+        doc["direction"] = column("the direction", "direction") | words
     return ColumnFile.model_validate(doc)
+
+
+def _prompted(text: str, usual: str) -> str:
+    return str(typer.prompt(text, default=usual, err=True))
 
 
 def _asked(contents: Sequence[Content], answers: Answers) -> Answers:

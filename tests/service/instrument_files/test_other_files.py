@@ -195,6 +195,36 @@ def test_what_is_wrong_in_a_table(folder: Folder, wrong: str) -> None:
     assert folder.refused("t.csv", table, columns).startswith(message)
 
 
+DRIFT = "t min;x um;spindle\n0;2.0;20.1\n1;2.5;20.4\n2;3.5;20.9\n"
+STOOD = """axis = "Z"
+at_mm = 120.0
+[time]
+column = "t min"
+unit = "min"
+[deviation]
+column = "x um"
+unit = "um"
+[spindle_temperature]
+column = "spindle"
+unit = "C"
+"""
+
+
+def test_readings_over_time_of_an_axis_that_stood(folder: Folder) -> None:
+    made = campaign_of([folder.read("d.csv", DRIFT, STOOD)], Answers(), "c", None)
+    columns = made.folder.run_files[0]["columns"]
+    assert (columns["t_s"], columns["z_mm"]) == ([0.0, 60.0, 120.0], [120.0] * 3)
+    np.testing.assert_allclose(columns["deviation_mm"], [0, 0.0005, 0.0015])
+    assert columns["temp_spindle_C"] == [20.1, 20.4, 20.9]
+    evenly = STOOD.replace('[time]\ncolumn = "t min"\nunit = "min"\n', "").replace("at_mm", "every_s = 20.0\nat_mm")
+    test = folder.read("d.csv", DRIFT, evenly).test
+    assert test is not None
+    assert test.t_s is not None
+    assert test.t_s.tolist() == [0.0, 20.0, 40.0]
+    neither = STOOD.replace("at_mm = 120.0\n", "")
+    assert folder.refused("d.csv", DRIFT, neither).startswith("columns.toml: expected either target, or at_mm")
+
+
 def workbook(path: Path, rows: list[list[str | float]]) -> None:
     """A workbook of one sheet, as any program may write it: inline strings, numbers."""
     cell = lambda r, v: f'<c r="{r}"><v>{v!r}</v></c>' if isinstance(v, float) else f'<c r="{r}" t="str"><v>{v}</v></c>'  # noqa: E731
