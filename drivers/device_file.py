@@ -189,6 +189,7 @@ class DeviceFile(Table):
     flags: tuple[Flag, ...] = ()
     zero: Command | None = Field(default=None, description="sets the displacement to zero; absent: Abbe subtracts the reading")
     clear: Command | None = Field(default=None, description="clears a latched error")
+    compensate: Command | None = Field(default=None, description="switches the correction for the air on")
     limits: Limits
 
     @model_validator(mode="after")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 import statistics
 from collections.abc import Awaitable, Callable
@@ -19,7 +20,7 @@ Ask = Callable[[str], Awaitable[object]]
 PASSED, FAILED, NOT_PROVED = Verdict.PASSED, Verdict.FAILED, Verdict.NOT_PROVED
 SAMPLES = 10
 """Least number of readings at rest, and how long they are taken at least, s."""
-AVERAGED = 3
+AVERAGED, SETTLED_S = 3, 0.3
 WATCHED_S = 1.0
 CLOCK_FACTOR = 2.0
 """The device's clock may differ from this computer's by this factor in a test of a second; a wrong unit differs by 1000."""
@@ -149,7 +150,9 @@ async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, a
 
 
 async def _mean(probe: Probe, name: str) -> float:
-    number, values = None, []
+    """Mean of some readings that began after now and a short time to settle."""
+    await asyncio.sleep(SETTLED_S)
+    number, values = (await probe.sample(None)).number, []
     for _ in range(AVERAGED):
         sample = await probe.sample(number)
         number = sample.number

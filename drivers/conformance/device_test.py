@@ -6,6 +6,7 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
+from abbe.drivers.api import DeviceInfo
 from abbe.drivers.conformance.checks import Ask, Move, identity, motion, quality, rate
 from abbe.drivers.conformance.faults import faults
 from abbe.drivers.conformance.probe import ControlProbe, MeterProbe, Probe, SourceProbe
@@ -16,7 +17,7 @@ from abbe.drivers.described.opening import Described, described, open_source
 from abbe.drivers.described.tested import Ability, Finding, TestReport, Verdict
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import BadUrl, DriverError
-from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, SocketUrl, described_by, installed, parse_url
+from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, SocketUrl, described_by, installed, parse_url
 from abbe.drivers.registry import open_controller, open_laser
 
 LATE_SHARE = 1.5
@@ -60,6 +61,8 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
     try:
         info = await probe.identify()
         found = [*await identity(probe, file), *await rate(probe, file)]
+        if any(one.verdict is Verdict.FAILED for one in found):
+            return _report(text, about, options.role, info, found, utc)
         if options.ask is not None and options.move is not None:
             found += await motion(probe, file, options.move, options.ask)
             found += [await quality(probe, file, options.ask)] if "displacement" in probe.moved else []
@@ -67,9 +70,15 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
             found += [Finding(f"motion {name}", Verdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
     finally:
         await probe.close()
+    if about is not None and not isinstance(about.url, ModbusRtuUrl):
+        found.append(Finding("check sum", Verdict.NOT_PROVED, "its replies carry none: a digit that is flipped on the way cannot be seen"))
     if options.faults:
         found += await _faults(text, about, options.role)
-    kind = file.kind if file is not None else options.role
+    return _report(text, about, options.role, info, found, utc)
+
+
+def _report(text: str, about: Described | None, role: str, info: DeviceInfo, found: list[Finding], utc: str) -> TestReport:
+    kind = role if about is None else about.file.kind
     return TestReport(
         text.partition("&tested=")[0], kind, info.model, info.serial_no, "" if about is None else about.sha256, utc,
         abilities(kind, tuple(found)), tuple(found),

@@ -51,6 +51,7 @@ class MeterProbe:
 
     async def zero(self) -> None:
         await self._meter.clear_beam()
+        await self._meter.set_environment_compensation(True)
         await self._meter.zero()
 
     async def sample(self, after: int | None) -> Sample:

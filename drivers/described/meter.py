@@ -89,16 +89,20 @@ class DescribedMeter:
             await self._command(self.file.clear, "clear")
 
     async def set_environment_compensation(self, on: bool) -> None:
-        """Do nothing, because such a device has no switch for it.
+        """Send the command of the device file that switches the correction on; without one, do nothing.
 
         Raises
         ------
         NotProved
-            The device measures with light and does not correct for the air, or always corrects.
+            The device measures with light and does not correct for the air, or cannot stop correcting.
+        ReplyTimeout, LinkDown, BadFrame, Refused
+            Communication failed, or the command is not acknowledged.
         """
         if on and self.file.air == "vacuum":
             detail = "it does not correct its wavelength for the air: lengths would be some 270 ppm too large"
             raise NotProved(self.name, "switch environmental compensation", detail, "use an instrument that compensates")
+        if on and self.file.compensate is not None:
+            await self._command(self.file.compensate, "switch environmental compensation")
         if not on and self.file.air == "compensated":
             raise NotProved(self.name, "switch environmental compensation", "it cannot be switched off", "measure with it")
 

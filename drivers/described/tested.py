@@ -15,16 +15,16 @@ FORMAT = "abbe-device-test/1"
 
 
 class Ability(StrEnum):
-    """What a device can be used for; each needs more proofs than the one before."""
+    """What a device can be used for; the second needs more proofs.
+
+    No report of this test lets a device command motion or hold tables: that takes a driver of its own, whose banks, read-back and
+    compare-and-swap `abbe comp commission` proves.
+    """
 
     WATCH = "watch"
     """Its values can be shown."""
     DWELL = "dwell"
     """Its readings count: at standstills of an operator's NC program, or of a motion that Abbe commands."""
-    MOVE = "move"
-    """It moves a machine."""
-    TABLES = "tables"
-    """It holds compensation tables: two banks, read-back, compare-and-swap (`abbe comp commission` proves them)."""
 
 
 class Verdict(StrEnum):

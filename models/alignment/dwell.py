@@ -158,6 +158,8 @@ def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], a
 CLEAR = 6.0
 """Two samples that differ by more than this many standard deviations show motion."""
 RESOLVED = 1e-6
+FLICKER = 2.5
+"""Two samples of an instrument at rest differ by less than this many of its steps."""
 LEAST_SAMPLES = 4
 OVERSHOOT, OVERSHOOT_MM = 0.3, 0.1
 """Largest overshoot of a controller: as a share of the move, and absolute, mm."""
@@ -180,7 +182,7 @@ def noise_of(y: F1) -> float:
     return float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6.0))
 
 
-def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Standstill, ...]:
+def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float, step: float = 0.0) -> tuple[Standstill, ...]:
     """Return all standstills of a stream, in order.
 
     Two neighbouring samples belong to one standstill if noise explains their difference. A single outlier does not end a standstill.
@@ -193,8 +195,10 @@ def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float) -> tuple[Sta
         Smallest planned move between standstills, in the unit of ``y``.
     least_s : float
         Shortest standstill that counts.
+    step : float
+        Smallest step of the readings: a coarse instrument at rest flickers by one or two.
     """
-    limit = max(CLEAR * np.sqrt(2.0) * noise_of(y), RESOLVED * smallest_move)
+    limit = max(CLEAR * np.sqrt(2.0) * noise_of(y), RESOLVED * smallest_move, FLICKER * step)
     still = np.abs(np.diff(y)) <= limit
     out: list[Standstill] = []
     for first, last in _runs(still):
@@ -279,7 +283,7 @@ class Dwells:
     noise: float
 
 
-def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None) -> Dwells:
+def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float, zero: float | None = None, step: float = 0.0) -> Dwells:
     """Match the standstills of a stream to the planned ones, in order, and take the planned readings from them.
 
     A missing or unplanned standstill is reported and does not shift the others.
@@ -295,6 +299,8 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     zero : float, optional
         Reading of the instrument at target 0, if it was zeroed there. Without it the match determines the offset between plan and stream,
         and is refused if two offsets explain the stream equally well.
+    step : float
+        Smallest step of the readings; the uncertainty of a mean contains it (GUM F.2.2.1), because samples at rest share their rounding.
 
     Raises
     ------
@@ -308,7 +314,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     smallest = float(np.abs(np.diff(targets)).min())
     if not smallest > 0.0:
         raise ValueError("dwells: two planned standstills in a row have the same target; plan them as one standstill with two readings")
-    found = stands(t_s, y, smallest_move=smallest, least_s=SHORT * settle_s)
+    found = stands(t_s, y, smallest_move=smallest, least_s=SHORT * settle_s, step=step)
     tolerance = min(TOLERANCE * smallest, LARGEST_MM)
     _check_jumps(found, tolerance)
     noise = noise_of(y)
@@ -328,7 +334,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
             stand = replace(stand, start_s=max(stand.start_s, stand.end_s - plan.seconds))
         elif stand is not None and (k == len(planned) - 1 or lasted[k] > LONG):  # the axis may have left later and come back
             stand = replace(stand, end_s=min(stand.end_s, stand.start_s + plan.seconds))
-        readings += [None] * plan.readings if stand is None else _readings(t_s, y, stand, plan, (settle_s, noise))
+        readings += [None] * plan.readings if stand is None else _readings(t_s, y, stand, plan, (settle_s, noise, step))
     ends = (0, len(planned) - 1)  # the program may stand longer at its start and its end
     odd = tuple(k for k in pairs if lasted[k] < SHORT or (lasted[k] > LONG and k not in ends))
     missing = tuple(k for k in range(len(planned)) if k not in pairs)
@@ -437,22 +443,22 @@ def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
 
 
-def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[float, float]) -> list[DwellReading | None]:
+def _readings(t_s: F1, y: F1, stand: Standstill, plan: PlannedDwell, how: tuple[float, float, float]) -> list[DwellReading | None]:
     """Split the settled part of a standstill into as many equal parts as it has planned readings, and average each."""
-    settle_s, noise = how
+    settle_s, noise, step = how
     at = np.arange(stand.first, stand.last + 1)
     at = at[(t_s[at] >= stand.start_s) & (t_s[at] <= stand.end_s)]
     settled = at[t_s[at] >= min(stand.start_s + settle_s, stand.end_s - 0.4 * (stand.end_s - stand.start_s))]
     settled = settled[:-1] if settled.size > LEAST_SAMPLES else settled  # the axes may have moved at the last sample
     out: list[DwellReading | None] = []
     for part in np.array_split(settled, plan.readings):
-        out.append(_mean(t_s[part], y[part], noise) if part.size else None)
+        out.append(_mean(t_s[part], y[part], noise, step) if part.size else None)
     return out
 
 
-def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
-    """Return the mean without outliers, and its uncertainty from the local scatter or, if larger, the noise of the stream."""
-    keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
+def _mean(t_s: F1, y: F1, noise: float, step: float) -> DwellReading:
+    """Return the mean without outliers, and its uncertainty from rounding and the local scatter or, if larger, the noise of the stream."""
+    keep = np.abs(y - np.median(y)) <= CLEAR * max(noise, step, 1.4826 * float(np.median(np.abs(y - np.median(y)))))
     kept = y[keep]
     scatter = max(noise, float(np.std(kept, ddof=1)) if kept.size > 1 else 0.0)
     related = 1.0
@@ -461,7 +467,8 @@ def _mean(t_s: F1, y: F1, noise: float) -> DwellReading:
         power = float(rest @ rest)
         rho = float(rest[1:] @ rest[:-1]) / power if power > 0.0 else 0.0
         related = (1.0 + max(rho, 0.0)) / (1.0 - min(max(rho, 0.0), 0.9))
-    return DwellReading(float(kept.mean()), scatter * float(np.sqrt(related / kept.size)), float(t_s[0]), float(t_s[-1]), int(kept.size))
+    u = float(np.hypot(scatter * np.sqrt(related / kept.size), step / np.sqrt(12.0)))
+    return DwellReading(float(kept.mean()), u, float(t_s[0]), float(t_s[-1]), int(kept.size))
 
 
 def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:

@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import ControllerStatus, LaserReading, Point, air_doc, air_is_compensated
+from abbe.drivers.api import ControllerStatus, LaserReading, Point, air_doc, air_is_compensated, resolution_mm
 from abbe.drivers.errors import DriverError, run_to_end
 from abbe.models.alignment.clock import ClockFit, fit_clock
 from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, detect, merged, named
@@ -106,7 +106,7 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
         raise MeasurementFault(
             f"test {test.label}: the laser's environmental compensation was switched off", "switch it on, start the program again"
         )
-    found, planned = _detected(test, heard, plan)
+    found, planned = _detected(test, heard, plan, resolution_mm(laser))
     lines = named(found, planned)
     times, lag = _controller_times(heard)
     middles = row_times(found.readings, heard.readings[0].device_us * 1e-6, plan[0].settle_s + LASER_DWELL_S)
@@ -162,11 +162,11 @@ async def _hear(session: Session, quiet_s: float) -> Heard:
             return heard
 
 
-def _detected(test: TestPlan, heard: Heard, plan: list[ListenRequest]) -> tuple[Dwells, tuple[PlannedDwell, ...]]:
+def _detected(test: TestPlan, heard: Heard, plan: list[ListenRequest], step_mm: float) -> tuple[Dwells, tuple[PlannedDwell, ...]]:
     t, y = _stream(heard)
     planned = merged([PlannedDwell(one.along_mm, one.settle_s + LASER_DWELL_S) for one in plan])
     try:
-        return detect(t, y, planned, settle_s=plan[0].settle_s, zero=0.0), planned
+        return detect(t, y, planned, settle_s=plan[0].settle_s, zero=0.0, step=step_mm), planned
     except ValueError as error:
         raise MeasurementFault(f"test {test.label}: {error}", "start the program of this recipe, then listen again") from None
 

@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any
 
 from abbe.drivers.api import LaserReading
+from abbe.drivers.device_file import load
 from abbe.drivers.errors import DriverError, ReplyTimeout, WrongDevice
 from abbe.drivers.fixture.driver import ConsoleFixture
-from abbe.drivers.links.urls import FixtureConsoleUrl, parse_url
+from abbe.drivers.links.urls import FixtureConsoleUrl, described_by, installed, parse_url
 from abbe.service.config_schema import MachineFile
 from abbe.service.devices.session import Session, raise_all
 from abbe.service.domain.schedule import Schedule
@@ -168,7 +169,20 @@ def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausi
     """Check a whole machine file without connecting to anything. ``folder``: of the machine file, with the recipe files."""
     site = site_of(config)
     rare = [*_strokes(config), *_window(config), *certificates(site, today), *_far(site, today), *_none(site)]
-    return Plausibility(tuple(unattended(config, site, folder)), tuple(rare))
+    return Plausibility((*_device_files(site), *unattended(config, site, folder)), tuple(rare))
+
+
+def _device_files(site: Site) -> list[str]:
+    """Return what is wrong with the device files that the addresses name; no device is connected."""
+    found = []
+    for role in (CNC, LASER, BALLBAR):
+        url = getattr(site.urls, role)
+        if url is not None and installed(url) is None and (named := described_by(parse_url(url))):
+            try:
+                load(named.device)
+            except DriverError as error:
+                found.append(f"devices.{role}: {error}")
+    return found
 
 
 def check_unattended(config: MachineFile, folder: Path) -> None:

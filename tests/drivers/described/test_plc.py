@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -17,11 +17,30 @@ from abbe.drivers.conformance.device_test import Options, device_test
 from abbe.drivers.described.opening import open_control
 from abbe.drivers.described.tested import Ability
 from abbe.drivers.device_file import SHIPPED
-from abbe.drivers.errors import WrongDevice
+from abbe.drivers.errors import NotProved, WrongDevice
 from abbe.drivers.links.urls import parse_url
 from abbe.drivers.registry import open_controller
+from abbe.service.compensation.gate import PushContext, check_preconditions
+from abbe.service.compensation.recover import accept, recovered_session
+from abbe.service.config import load_machine
+from abbe.service.domain.progress import ignore_progress
+from abbe.service.errors import ConfigError
+from abbe.service.site import site_of
+from abbe.service.storage.store import Store
+from abbe.service.tables.nine_tables import read_base
 from tests.drivers.described.foreign import free_port
 from tests.drivers.described.test_device_test import UTC, kept, verdict
+
+MACHINE = """
+name = "mill"
+chain = "w-X-Y-b-Z-t"
+[stroke_mm]
+X = [0, 100]
+Y = [0, 100]
+Z = [0, 100]
+[devices]
+cnc = "{url}"
+"""
 
 
 class Plc:
@@ -32,9 +51,11 @@ class Plc:
         self.flags = 0
         self.cycles = 0
         self.stuck = False
+        self.written = 0
 
     async def renew(self, function: int, start: int, address: int, count: int, registers: list[int], values: object) -> None:
         self.cycles += not self.stuck
+        self.written += function not in (3, 4)
         data = struct.pack("<I6x", 0x41424245) + bytes(10) + struct.pack("<3iHH", *self.at_um, self.cycles & 0xFFFF, self.flags)
         registers[: len(data) // 2] = struct.unpack(f">{len(data) // 2}H", data)
 
@@ -95,3 +116,23 @@ async def test_an_axis_the_wrong_way_round_is_named(plc: tuple[Plc, str]) -> Non
     assert [one.check for one in report.failed] == ["motion y"]
     assert "sign: it grows the wrong way" in report.failed[0].text
     assert report.abilities == ()
+
+
+async def test_every_way_to_a_table_ends_before_anything_is_written(plc: tuple[Plc, str], tmp_path: Path) -> None:
+    made, url = plc
+    report = kept(await device_test(url, Options(move=Move(5.0, 0.01), ask=made.person, faults=False), UTC), tmp_path)
+    (tmp_path / "mill.toml").write_text(MACHINE.format(url=f"{url}&tested={report.name}"))
+    site = site_of(load_machine(tmp_path / "mill.toml").machine)
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        async with recovered_session(store, site) as session:
+            ways: list[Callable[[], Awaitable[object]]] = [
+                lambda: read_base(session.controller),
+                lambda: accept(session.controller, store, site),
+                lambda: check_preconditions(PushContext(session, store, site, ignore_progress)),
+            ]
+            for way in ways:
+                with pytest.raises((NotProved, ConfigError)):
+                    await way()
+            with pytest.raises(NotProved, match="it shows no compensation tables"):
+                await read_base(session.controller)
+    assert made.written == 0

@@ -152,3 +152,25 @@ def test_the_machine_may_stand_long_before_the_first_and_after_the_last():
     assert found.readings[-1].samples < 25
     late = detect(t[14:], y[14:], planned, settle_s=SETTLE_S, zero=0.0)
     assert "standstill 1 was much longer or shorter than the planned 1.0 s" in named(late, planned)
+
+
+def test_a_coarse_instrument_at_rest_flickers_and_its_uncertainty_holds_the_rounding():
+    """A dial gauge of 1 um beside 0.2 um of noise: nearly all samples of a standstill are the same, some are one step off."""
+    step, rng = 1e-3, np.random.default_rng(7)
+    targets = [0.0, 2.0, 4.0, 6.0, 4.0, 2.0, 0.0]
+    planned = merged([PlannedDwell(x, 1.0) for x in targets])
+    knots_s, knots_mm = [0.0], [0.0]
+    for target in targets:
+        knots_s += [
+            knots_s[-1] + max(abs(target - knots_mm[-1]) / 5.0, 0.05),
+            knots_s[-1] + max(abs(target - knots_mm[-1]) / 5.0, 0.05) + 1.0,
+        ]
+        knots_mm += [target * 1.0002, target * 1.0002]
+    t = np.arange(0.0, knots_s[-1], 0.05)
+    y = np.round((np.interp(t, knots_s, knots_mm) + 2e-4 * rng.normal(size=t.size)) / step) * step
+    assert noise_of(y) == 0.0
+    found = detect(t, y, planned, settle_s=SETTLE_S, zero=0.0, step=step)
+    assert found.missing == ()
+    for reading, target in zip((one for one in found.readings if one is not None), targets, strict=True):
+        assert abs(reading.value - 1.0002 * target) < 2.0 * reading.u
+        assert step / np.sqrt(12.0) <= reading.u < step
