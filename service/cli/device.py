@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
+from shlex import quote
 from typing import Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, print_json, print_table
+from abbe.service.cli.common import JsonOption, answer, conclude, print_json, print_table
 
 device = typer.Typer(no_args_is_help=True, help="Test devices, list the device files that come with Abbe.")
 
@@ -22,6 +23,7 @@ def list_files(as_json: JsonOption = False) -> None:
         print_json([{"name": name, "kind": file.kind, "device": file.name} for name, file in found])
         return
     print_table(("name", "kind", "device"), [(name, file.kind, file.name) for name, file in found])
+    conclude("abbe doctor", verdict=f"{len(found)} device files")
 
 
 @device.command("test")
@@ -51,10 +53,9 @@ def try_device(
     report = asyncio.run(device_test(url, options, SystemClock().utc().isoformat()))
     if out is not None:
         write_page(json.dumps(report.to_document(), indent=2) + "\n", out)
-    if as_json:
-        print_json(report.to_document())
-    else:
-        lines = [f"{one.verdict:10} {one.check}: {one.text}" for one in report.findings]
-        kept = [] if out is None else [f"report: {out}"]
-        typer.echo("\n".join([f"{report.kind}: {report.model} {report.serial_no}".rstrip(), *lines, summary(report), *kept]))
+    lines = [f"{report.kind}: {report.model} {report.serial_no}".rstrip()]
+    lines += [f"{one.verdict:10} {one.check}: {one.text}" for one in report.findings]
+    lines += [summary(report), *([] if out is None else [f"report: {out}"])]
+    answer(report.to_document(), *lines, as_json=as_json)
+    conclude(f"abbe device test {quote(url)}" if report.failed else "abbe doctor", as_json=as_json)
     raise typer.Exit(1 if report.failed else 0)

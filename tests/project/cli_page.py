@@ -12,6 +12,7 @@ import typer
 
 from abbe.service.cli import EXIT_CODES
 from abbe.service.cli.app import app
+from tests.service.cli.every_command import table
 from tests.written_page import run
 
 PAGE = Path(__file__).resolve().parents[2] / "docs" / "reference" / "cli.md"
@@ -34,15 +35,20 @@ and `--out` where they say nothing else.
 
 `abbe --install-completion` makes the shell complete commands and options (bash, zsh, fish, PowerShell).
 """
+_EVERY = """
+## Every command at a glance
+
+What the tests prove of each command; the next command is the last line on standard error.
+
+"""
 _COMMON = ("Print JSON on stdout.", "Machine file. Default:", "Database, instead of", "Write the answer to a file")
 
 
 def page() -> str:
     """The whole page."""
     root = typer.main.get_command(app)
-    return _HEAD.replace("EXIT CODES", "".join(f"| {code} | {text} |\n" for code, text in EXIT_CODES.items())) + "".join(
-        _section(name, command) for name, command in _commands(root, "abbe")
-    )
+    head = _HEAD.replace("EXIT CODES", "".join(f"| {code} | {text} |\n" for code, text in EXIT_CODES.items()))
+    return head + "".join(_section(name, command) for name, command in _commands(root, "abbe")) + _EVERY + table()
 
 
 def _commands(group: Any, name: str) -> Iterator[tuple[str, Any]]:

@@ -213,8 +213,8 @@ def test_once_checks_tells_raises_the_alarm_ends_with_1_and_says_what_a_bad_camp
     timetable = '[[schedule]]\nname = "weekly"\ncron = "0 6 * * 1"\nrecipe = "quick-check at 20 Hz"\non_alarm = "propose"\n'
     out = f'[verify]\nhelix_rms_um = 1\n[mqtt]\nurl = "{broker.url}"\ntopic_prefix = "plant/abbe"\n[web]\nport = 0\n{timetable}'
     sims = start_sims("--speed", "100", "--seed", "2", extra=out)
-    assert run(["serve", "-m", str(sims.machine_file), "--once"]) == 1, capsys.readouterr().err
-    capsys.readouterr()
+    assert run(["serve", "-m", str(sims.machine_file), "--once", "--json"]) == 1, capsys.readouterr().err
+    assert json.loads(capsys.readouterr().out) == {"machine": "sim", "exit_code": 1, "text": "not all checks passed"}
     result = payload(heard.expect("sim/verification"))
     assert (result["verdict"], result["schedule"]) == ("fail", "weekly (once)")
     assert run(["alarm", "list", "-m", str(sims.machine_file), "--json"]) == 0

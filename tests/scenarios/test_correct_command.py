@@ -116,6 +116,8 @@ def killed(identified, tmp_path_factory) -> Killed:
 def done(ended: tuple[int, str, str]) -> tuple[str, str]:
     """What a command that ended well has said: stdout, stderr."""
     assert ended[0] == 0, ended[2]
+    if not ended[1].startswith("{"):
+        assert ended[2].splitlines()[-1].startswith("next: abbe ")
     return ended[1:]
 
 
@@ -169,7 +171,7 @@ def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_u
     for words in (("measure", "-m", machine, *HELIX), ("correct", "-m", machine, "june")):
         refused(command(*words), "CMP-002", f"(CRC {killed.crc}) is that of push 1 of machine 'sim'", "never verified", "accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
-    out, _ = done(command("accept-table", "-m", machine, "--yes"))
+    out, _ = done(command("accept-table", "-m", machine, "--yes", "--json"))
     assert "it is that of push 1 of machine 'sim', which no measurement has verified" in out
     old = tmp_path / "old.toml"  # under the old name it is closed, too: an accepted table is not taken back
     old.write_text(Path(machine).read_text().replace("mill-A", "sim").replace("localhost", "127.0.0.1"))

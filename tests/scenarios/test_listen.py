@@ -66,7 +66,9 @@ def test_a_program_that_the_operator_starts_gives_the_same_readings(abbe, comman
                 sims.ask("program", blocks=blocks)
     watchdog.cancel()
     listening.wait()
-    assert listening.returncode == 0, listening.stderr.read()
+    told = listening.stderr.read()
+    assert listening.returncode == 0, told
+    assert told.splitlines()[-1] == f"next: abbe solve heard -m {machine}"
     assert any("d1: standstill 3 of 7 (at" in text and "is missing" in text for text in said)
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         driven = {r.label: load_run(store, r.id).to_document() for r in store.runs.all("driven")}

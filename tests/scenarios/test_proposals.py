@@ -253,9 +253,12 @@ def test_a_proposal_with_reasons_is_kept_to_look_at_and_goes_nowhere(shop, capsy
     assert run(["comp", "approve", number, "--as", "anna", "--machine", str(strict)]) == 1
     assert "reasons against it" in capsys.readouterr().out
     assert run(["comp", "push", "-m", str(strict), number, "--before", "start"]) == 1
-    assert "not pushed: VALUE" in capsys.readouterr().out
-    assert run(["comp", "push", "-m", shop.file, number, "--before", "start"]) == 1  # and not under wider limits either
-    assert "not pushed: LIMITS" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "not pushed: VALUE" in said.out
+    assert said.err.splitlines()[-1] == f"next: abbe comp show {number} -m {strict}"
+    assert run(["comp", "push", "-m", shop.file, number, "--before", "start", "--json"]) == 1  # and not under wider limits either
+    told = json.loads(capsys.readouterr().out)
+    assert (told["kept"], told["text"].partition(":")[0]) == (False, "LIMITS")
     assert shop.words() == shop.untouched
 
 

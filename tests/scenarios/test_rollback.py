@@ -143,8 +143,10 @@ def test_an_open_push_is_finished_first_and_that_is_all(start_sims, tmp_path, mo
     assert "push 2 was unfinished and is ended now" in capsys.readouterr().out
     table, entries = asyncio.run(now())
     assert (table, entries[-1]) == (kept, (2, PushState.ROLLED_BACK))
-    assert run(["comp", "rollback", "-m", str(sims.machine_file), "--yes"]) == 0  # ordered once more: further back
-    assert "in force again (push 3" in capsys.readouterr().out
+    assert run(["comp", "rollback", "-m", str(sims.machine_file), "--yes", "--json"]) == 0  # ordered once more: further back
+    told = json.loads(capsys.readouterr().out)
+    assert told["push"] == 3
+    assert "in force again (push 3" in told["text"]
     assert asyncio.run(now())[0][1] != kept[1]
 
 

@@ -34,7 +34,9 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
     asyncio.run(kept())
     assert fleet(url, capsys)["verdict"] == "verified"
     assert run(["measure", "-m", file, *QUICK, "--name", "first"]) == 0
-    assert re.search(r"^check 1: (pass|fail|cannot tell): ", capsys.readouterr().out, re.MULTILINE)
+    said = capsys.readouterr()
+    assert re.search(r"^check 1: (pass|fail|cannot tell): ", said.out, re.MULTILINE)
+    assert said.err.splitlines()[-1] == f"next: abbe report first -m {file}"
     first = fleet(url, capsys)
     assert first["verified"]["why"] == "check"
     assert first["figures"]
@@ -46,8 +48,9 @@ def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(star
     with Store.open(url) as store:
         assert len(store.pushes.entries("sim")) == before
     assert run(["comp", "rollback", "-m", file, "--yes"]) == 0
-    out = capsys.readouterr().out
-    assert out.splitlines()[-1] == f"the machine is unverified now: abbe measure -m {file} --recipe quick-check"
+    said = capsys.readouterr()
+    assert said.out.splitlines()[-1] == f"the machine is unverified now: abbe measure -m {file} --recipe quick-check"
+    assert said.err.splitlines()[-1] == f"next: abbe measure -m {file} --recipe quick-check"
     line = fleet(url, capsys)
     assert (line["verdict"], line["verified"]["why"], line["figures"]) == ("unverified", "rollback", [])
     target = tmp_path / "first.json"

@@ -35,15 +35,24 @@ def version(as_json: JsonOption = False) -> None:
     conclude("abbe doctor", as_json=as_json)
 
 
-def sim(context: typer.Context) -> None:
-    """Run the simulated machine and its instruments until Ctrl-C; --machine-file FILE: write a machine file for them.
+def sim(
+    context: typer.Context,
+    file: Annotated[
+        Path | None, typer.Option("--machine-file", metavar="FILE", help="Write a machine file for it.", show_default=False)
+    ] = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Run the simulated machine and its instruments until Ctrl-C.
 
     Prints one JSON object with the addresses. Other arguments go to the module `abbe.simulators`.
     """
+    from abbe.service.errors import ConfigError
+
     # Its own process group: Ctrl-C reaches the child once, from here, and not again from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
-    arguments = [word for word in context.args if word != "--json"]  # it prints nothing else
-    file = _machine_file_of(arguments)
+    arguments = list(context.args)
+    if file is not None and file.exists():
+        raise ConfigError(f"{file} exists", "remove it, or give another name")
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:
         # The child ends when this pipe closes, even if this process is killed by SIGKILL.
         arguments.append("--watch-stdin")
@@ -59,7 +68,7 @@ def sim(context: typer.Context) -> None:
     handlers = {number: signal.signal(number, forward) for number in (signal.SIGINT, signal.SIGTERM)}
     try:
         if file is not None and child.stdout is not None:
-            _write_machine_file(child.stdout.readline(), file)
+            _write_machine_file(child.stdout.readline(), file, as_json=as_json)
         code = child.wait()
     finally:
         for number, handler in handlers.items():
@@ -70,22 +79,7 @@ def sim(context: typer.Context) -> None:
     raise typer.Exit(code if code >= 0 else 128 - code)
 
 
-def _machine_file_of(arguments: list[str]) -> Path | None:
-    """Take ``--machine-file FILE`` out of the arguments and return the file."""
-    from abbe.service.errors import ConfigError
-
-    if "--machine-file" not in arguments:
-        return None
-    at = arguments.index("--machine-file")
-    if at + 1 == len(arguments):
-        raise ConfigError("--machine-file has no file", "write --machine-file abbe.toml")
-    _, name = arguments.pop(at), arguments.pop(at)
-    if Path(name).exists():
-        raise ConfigError(f"{name} exists", "remove it, or give another name")
-    return Path(name)
-
-
-def _write_machine_file(line: bytes, file: Path) -> None:
+def _write_machine_file(line: bytes, file: Path, *, as_json: bool) -> None:
     """Write the machine file of simulators that have told their addresses; nothing if they have ended."""
     from dataclasses import replace
     from datetime import timedelta
@@ -99,7 +93,7 @@ def _write_machine_file(line: bytes, file: Path) -> None:
     site, day = demo_site(json.loads(line)), SystemClock().utc().date() + timedelta(days=SIMULATED_DAYS)
     write_page(machine_file_of(replace(site, calibrated_until=dict.fromkeys(site.calibrated_until, day))), file)
     typer.echo(line.decode().rstrip())
-    conclude("abbe doctor", machine=None if file == Path(DEFAULT_MACHINE) else file)
+    conclude("abbe doctor", machine=None if file == Path(DEFAULT_MACHINE) else file, as_json=as_json)
 
 
 def check_config(

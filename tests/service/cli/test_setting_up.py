@@ -85,12 +85,14 @@ def test_a_person_is_asked_eight_questions(folder: Path) -> None:
 @pytest.fixture
 def simulated_machine(folder: Path):
     """`abbe sim --machine-file`, until the test ends."""
-    process = subprocess.Popen([*ABBE, "sim", "--speed", "50", "--machine-file", "abbe.toml"], stdout=subprocess.PIPE, text=True)
+    process = subprocess.Popen(
+        [*ABBE, "sim", "--speed", "50", "--machine-file", "abbe.toml"], stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
+    )
     assert process.stdout is not None
     yield json.loads(process.stdout.readline())
     process.send_signal(signal.SIGINT)
-    assert process.wait(within(20)) == 0
-    process.stdout.close()
+    assert process.communicate(timeout=within(20))[1] == "next: abbe doctor\n"
+    assert process.returncode == 0
 
 
 def test_the_doctor_reads_every_device_and_moves_nothing(simulated_machine, capsys) -> None:
@@ -108,6 +110,13 @@ def test_the_doctor_reads_every_device_and_moves_nothing(simulated_machine, caps
     assert "its devices are left alone" in said.out
     assert "ABB-1" not in said.out
     assert said.err.splitlines()[-1] == "next: abbe measure --recipe quick-check"
+
+
+def test_a_device_is_tested_and_told_for_programs(simulated_machine, capsys) -> None:
+    code = run(["device", "test", simulated_machine["laser"], "--no-faults"])
+    assert capsys.readouterr().err.splitlines()[-1].startswith("next: abbe ")
+    assert run(["device", "test", simulated_machine["laser"], "--no-faults", "--json"]) == code
+    assert json.loads(capsys.readouterr().out)["kind"] == "laser"
 
 
 def test_the_doctor_says_what_to_do_about_a_device_that_is_not_there(folder: Path, capsys) -> None:

@@ -30,7 +30,9 @@ def test_a_part_of_the_files_holds_and_is_not_complete(folder, capsys):
     code, doc, err = answer(folder, capsys)
     assert (code, doc["ok"], doc["complete"], len(doc["missing"]), err) == (0, True, False, 11, "")
     assert run(["vectors", str(folder)]) == 0
-    last = capsys.readouterr().out.splitlines()[-1]
+    said = capsys.readouterr()
+    assert said.err.splitlines()[-1] == "next: abbe papers"
+    last = said.out.splitlines()[-1]
     assert last.startswith("3 of 14 files")
     assert last.endswith("all hold, NOT complete")
 

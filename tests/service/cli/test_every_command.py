@@ -1,0 +1,136 @@
+"""Every command: JSON on request, stable exit codes, completion, the next command on its last line, one line for a wrong input.
+
+The commands run in the order of `CASES`, in one folder: a user is added before the others change it.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import os
+import shlex
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from abbe.service.cli import run
+from abbe.service.cli.administration.audit import commands
+from abbe.service.cli.app import app
+from abbe.service.domain.document import document
+from abbe.service.effects.model_book import NewVersion, current
+from abbe.service.storage.store import Store
+from tests.pages_world import filled_once
+from tests.service.cli.every_command import CASES, Case
+from tests.service.conftest import ERRORS, write_json
+
+DEVICES = """[devices]
+cnc = "modbus+tcp://127.0.0.1:9"
+laser = "modbus+tcp://127.0.0.1:9"
+ballbar = "socket://127.0.0.1:9"
+fixture = "fixture+tcp://127.0.0.1:9"
+"""
+"""Nobody answers there."""
+pytestmark = pytest.mark.timeout(300)
+ROOT: Any = typer.main.get_command(app)
+HERE = [name for name, case in CASES.items() if not case.proof]
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory) -> Path:
+    """A folder with a filled database, its machine file, and a file for each command that reads one."""
+    filled = filled_once(tmp_path_factory)
+    folder = Path(filled.url.removeprefix("sqlite:///")).parent
+    with Store.open(filled.url) as store:
+        doc = store.machines.get(store.campaigns.find(filled.campaign).machine_id).doc
+        first = current(store, "VMC-1")
+        assert first is not None
+        store.models.add(NewVersion("VMC-1", 1, document(replace(first.book, parent=1, why="the axis was repaired"))))
+    lines = [f'name = "{filled.machine}"', f'chain = "{doc["chain"]}"', f"tool_mm = {doc['tool_mm']}", "[stroke_mm]"]
+    (folder / "abbe.toml").write_text("\n".join([*lines, *(f"{axis} = {at}" for axis, at in doc["stroke_mm"].items()), DEVICES]))
+    (folder / "words.json").write_text(json.dumps({"SOLUTION": filled.solution, "PROPOSAL": filled.proposals[-1]}))
+    write_json(folder / "errors.json", ERRORS)
+    (folder / "p.csv").write_text("x_mm,y_mm,z_mm\n100,200,50\n")
+    return folder
+
+
+class Call:
+    """Runs commands in the world, as a person types them."""
+
+    def __init__(self, folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+        for name in [name for name in os.environ if name.startswith("ABBE_")]:
+            monkeypatch.delenv(name)
+        monkeypatch.chdir(folder)
+        self.names = json.loads((folder / "words.json").read_text())
+        self.capsys, self.monkeypatch = capsys, monkeypatch
+
+    def filled(self, text: str, number: int) -> str:
+        for word, value in self.names.items():
+            text = text.replace(word, str(value))
+        return text.replace("#", str(number))
+
+    def __call__(self, words: str, *more: str, number: int = 1, typed: str = "") -> tuple[int, str, str]:
+        self.monkeypatch.setattr("sys.stdin", io.StringIO(typed))
+        code = run([*shlex.split(self.filled(words, number)), *more])
+        return code, *self.capsys.readouterr()
+
+
+@pytest.fixture
+def call(world: Path, capsys, monkeypatch) -> Call:
+    return Call(world, capsys, monkeypatch)
+
+
+def test_no_command_is_forgotten() -> None:
+    assert {name for name, _ in commands(app)} == set(CASES)
+    for case in CASES.values():
+        assert case.wrong
+        assert case.error
+        assert case.then
+        assert Path(case.proof or __file__).exists()
+
+
+def parsed(words: list[str]) -> str:
+    """The command that the words call; an error if they cannot be parsed."""
+    command, name = ROOT, []
+    while hasattr(command, "commands"):
+        name.append(words[0])
+        command, words = command.commands[words[0]], words[1:]
+    command.make_context(" ".join(name), list(words))
+    return " ".join(name)
+
+
+@pytest.mark.parametrize("name", HERE)
+def test_an_answer_names_the_next_command_and_is_json_on_request(name: str, call: Call) -> None:
+    case = CASES[name]
+    code, out, err = call(case.words, typed=case.typed)
+    assert code in case.codes, err
+    last = err.splitlines()[-1]
+    assert last.startswith(f"next: abbe {call.filled(case.then, 1)}"), last
+    assert parsed(shlex.split(last.removeprefix("next: abbe "))) in CASES
+    assert out.strip()
+    code, out, err = call(case.words, "--json", number=2, typed=case.typed)
+    assert code in case.codes, err
+    assert "next:" not in err
+    json.loads(out)
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_wrong_input_is_one_line_with_its_code(name: str, call: Call) -> None:
+    case: Case = CASES[name]
+    code, out, err = call(case.wrong, typed=case.typed)
+    assert (code, out) == (2, ""), err
+    assert err.startswith(f"error {case.error}: "), err
+    assert err.count("\n") == 1
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_a_shell_completes_its_options(name: str, call: Call) -> None:
+    words = f"abbe {name} --js"
+    call.monkeypatch.setenv("_ABBE_COMPLETE", "complete_bash")
+    call.monkeypatch.setenv("COMP_WORDS", words)
+    call.monkeypatch.setenv("COMP_CWORD", str(len(words.split()) - 1))
+    with pytest.raises(SystemExit) as ended:
+        run([])
+    assert (ended.value.code, call.capsys.readouterr().out.split()) == (0, ["--json"])
