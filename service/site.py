@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from typing import Any
@@ -12,6 +13,7 @@ from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import Limits, MachineFile
 from abbe.service.domain.machine import DeviceUrls, control_of
+from abbe.service.domain.material import AxisMaterial
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings
@@ -22,8 +24,8 @@ class Site:
     """What a workflow needs to know about a machine. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
     ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without a certificate is absent.
-    ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``control``: identity of the control
-    (`control_of`); empty without a control.
+    ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
+    stated temperature of the scales by axis. ``control``: identity of the control (`control_of`); empty without a control.
     """
 
     name: str
@@ -38,6 +40,7 @@ class Site:
     nc: NcSettings = field(default_factory=NcSettings)
     calibrated_until: dict[str, date] = field(default_factory=dict)
     two_people: bool = False
+    materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
     control: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -94,6 +97,7 @@ def site_of(config: MachineFile) -> Site:
         NcSettings(config.nc.acceleration_mm_s2, config.nc.heidenhain_tool, {str(name): kib for name, kib in config.nc.memory_kib.items()}),
         {kind: day for kind, day in (("ballbar", config.calibration.ballbar), ("laser", config.calibration.laser)) if day is not None},
         limits.two_people,
+        config.material.by_axis(),
     )
 
 

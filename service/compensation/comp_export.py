@@ -35,6 +35,7 @@ from abbe.service.rendering.page_file import write_page
 from abbe.service.signed import keys
 from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
 from abbe.service.site import machine_from_doc, site_of
+from abbe.service.verification.reduction import UNKNOWN
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
 ONLY_FRESH = "the tables assume that no table was active during the measurement: if one was, add it to them"
@@ -136,7 +137,7 @@ def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> F
     )
 
 
-def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh: bool = False) -> Exported:
+def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh: bool = False, holds_at: str = UNKNOWN) -> Exported:
     """Return the best tables that a control (or a format alone) can hold, as the text of its files.
 
     Parameters
@@ -147,6 +148,8 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
         Where the tables are zero; default: start of every stroke.
     fresh : bool
         No correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
+    holds_at : str
+        Temperature of the scales at which the solution holds.
 
     Raises
     ------
@@ -160,7 +163,7 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     if best.numbers == 0:
         raise FormatRefused(f"no kind of table of {control.name} reduces the errors", "the machine needs none; nothing was written")
     files = files_of(best.compensation, control, settings_for(control, known.machine, reference))
-    return Exported(files, found, _notes(best.compensation, control, fresh=fresh))
+    return Exported(files, found, (f"holds at: {holds_at}", *_notes(best.compensation, control, fresh=fresh)))
 
 
 def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings) -> tuple[TextFile, ...]:

@@ -65,6 +65,8 @@ class Proposed:
         Reasons against it when it was proposed.
     not_for_tables : tuple of str
         Known effects that no table corrects.
+    holds_at : str
+        Temperature of the scales at which the tables hold; empty in proposals of earlier versions.
     """
 
     __pydantic_config__ = ConfigDict(arbitrary_types_allowed=True)
@@ -81,6 +83,7 @@ class Proposed:
     utc: str
     reasons: tuple[str, ...]
     not_for_tables: tuple[str, ...]
+    holds_at: str = ""
 
     @property
     def tables(self) -> NineTables:
@@ -139,6 +142,7 @@ def doc_of(proposed: Proposed) -> Doc:
         "utc": proposed.utc,
         "reasons": list(proposed.reasons),
         "not_for_tables": list(proposed.not_for_tables),
+        "holds_at": proposed.holds_at,
     }
     plain = _plain(doc)
     assert isinstance(plain, dict)

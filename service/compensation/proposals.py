@@ -229,6 +229,7 @@ async def make(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
         BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
         by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)), known.lines,
+        proposal.solved.holds_at,
     )  # fmt: skip
     plain = doc_of(proposed)
     number = await store.write(store.proposals.add, site.name, solution_id, plain, digest_of_doc(plain))

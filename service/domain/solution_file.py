@@ -260,6 +260,7 @@ class SolutionFile(FileObject):
     parameters: dict[str, ParameterValue]
     mean_over_volume: dict[str, MeanValue]
     mean_over_volume_note: str
+    holds_at: str | None = Field(default=None, description="scales' temperature at which solution and tables hold")
     motions: dict[str, MotionValue]
     rank: Rank
     not_observable: list[str]

@@ -24,6 +24,7 @@ from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
+from abbe.service.verification.reduction import holds_at
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
@@ -59,7 +60,8 @@ class Solved:
 
     ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
     ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
-    readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2).
+    readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
+    temperature of the scales at which the result holds, as text.
     """
 
     joint: JointSolution
@@ -71,6 +73,7 @@ class Solved:
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
     removed: tuple[str, ...] = ()
+    holds_at: str = ""
 
 
 def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
@@ -108,8 +111,9 @@ def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", 
     digests = {r.run_id: measured_digest(r) for r in used}
     tables = {r.run_id: r.table.document for r in used if r.table.crc is not None}
     return Solved(
-        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(removals_of(used))
-    )
+        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(removals_of(used)),
+        holds_at(used, site.materials),
+    )  # fmt: skip
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:

@@ -196,6 +196,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
             p.name: ParameterValue(value=p.value, u=p.u, data_share=p.share, status=p.status) for p in o.parameters if p.value is not None
         },
         mean_over_volume={p.name: MeanValue(value=p.value, u=p.u) for p in found.mean},
+        holds_at=found.solved.holds_at,
         mean_over_volume_note=f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
         rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),

@@ -52,6 +52,7 @@ class ProposalDetail(ProposalSummary):
     two_people: bool
     reasons: list[str]
     not_for_tables: list[str]
+    holds_at: str
     approvals: list[ProposalApproval]
     rejections: list[ProposalRejection]
 
@@ -127,6 +128,7 @@ def proposal(reader: Reader, number: int) -> ProposalDetail:
         two_people=proposed.two_people,
         reasons=list(proposed.reasons),
         not_for_tables=list(proposed.not_for_tables),
+        holds_at=proposed.holds_at,
         approvals=store.proposals.approvals(number),
         rejections=store.proposals.rejections(number),
     )

@@ -31,6 +31,7 @@ from abbe.service.runs.coverage import about_axis, not_judged, path_axis
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.imported_report import evaluate_imported
 from abbe.service.verification.iso_report import Evaluated, evaluate
+from abbe.service.verification.reduction import holds_at
 from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures
 
 SOLUTION_SIGNS: dict[str, Sign] = {"good": "ok", "usable with care": "open", "mostly assumption": "bad"}
@@ -75,11 +76,13 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
     checked, verdict = _verification(campaign.runs, rules)
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)
+    used = [run for run in campaign.runs if run.identifies]
+    holds = {} if found.solution is None else {"Solution holds at": holds_at(used, rules.materials)}
     remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *evaluated.remarks, *remarks]
     return Document(
         kind="campaign",
         title=f"Campaign {campaign.name}",
-        about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | found.facts,
+        about=parts.machine_facts(campaign.site.doc) | {"Campaign": campaign.name} | holds | found.facts,
         verdict=found.table.verdict(parts.verdict_of(verdict, remarks, _solution_verdict(found.solution))),
         figures=[*checked, *solved.figures, *evaluated.figures],
         instruments=parts.instruments(campaign.runs, campaign.doc, rules),

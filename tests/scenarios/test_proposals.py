@@ -37,7 +37,7 @@ from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import registers
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
-TWO = "[limits]\ntwo_people = true\n"
+TWO = "[material]\ntemperature_c = 21.5\n[limits]\ntwo_people = true\n"
 
 
 def controller_words(sims: Sims) -> tuple[int, ...]:
@@ -104,6 +104,14 @@ def try_push(shop: Shop, store: Store, number: int, *, site: Site | None = None,
 def test_proposing_writes_nothing_to_the_controller(shop):
     assert shop.proposed == 0
     assert shop.words() == shop.untouched
+
+
+def test_a_proposal_says_at_which_temperature_it_holds(shop, capsys):
+    assert run(["comp", "show", "1", "-m", shop.file]) == 0
+    stated = ", ".join(f"{axis} 21.50 ± 0.40 °C (stated in the machine file)" for axis in "XYZ")
+    assert f"holds at: {stated}" in capsys.readouterr().out
+    with Store.open(shop.url) as store:
+        assert store.solutions.get(store.proposals.get(1).solution_id).doc["holds_at"] == stated
 
 
 CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {

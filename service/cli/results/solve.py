@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from pathlib import Path
 from shlex import quote
@@ -101,8 +101,10 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         form_of(report)  # refuse a wrong suffix before the work
     if at is not None and out is None:
         raise ConfigError("--at and --out belong together", "give both: --at POINTS.csv --out FILE.csv")
+    # A folder and another database may be of another machine: its file has to be named.
+    file = machine if db is not None or is_folder(campaign) else named_machine(machine)
     points, target = (None, None) if at is None else (read_points(at).axes_mm, out)
-    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, target)
+    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, file, target)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
@@ -121,7 +123,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             summary, doc = _solved(store, chosen, wanted)
             doc |= store_solution(store, found, doc)
             if report is not None:
-                _write_report(store, chosen, summary, doc, machine if db is not None else named_machine(machine), report)
+                _write_report(store, chosen, summary, doc, file, report)
     with answer_into(out if at is None else None):
         if as_json:
             print_json(doc)
@@ -155,6 +157,7 @@ class _SolveRequest:
     unit_mm: float
     trials: bool
     points_mm: F2 | None
+    machine: Path | None
     out: Path | None
 
 
@@ -178,6 +181,7 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
     """Solve a campaign without its known effects; return the assessment of the solution and its document. Progress goes to stderr."""
     from abbe.service.cli.running import display
+    from abbe.service.config import load_machine
     from abbe.service.domain.progress import Progress
     from abbe.service.identification.effect_removal import remove_effects
     from abbe.service.identification.solve import solve_runs
@@ -186,6 +190,8 @@ def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tup
 
     known = remove_effects(store, chosen, campaign_table(store, chosen))
     campaign = known.campaign
+    if wanted.machine is not None:
+        campaign = replace(campaign, site=replace(campaign.site, materials=load_machine(wanted.machine).machine.material.by_axis()))
     with display() as sink:
         stages = iter(range(1, STAGES))
 

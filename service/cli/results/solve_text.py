@@ -40,7 +40,7 @@ def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
         f"campaign {solution.campaign}: model {solution.model}, {len(solution.runs)} runs; the readings determine {o.rank} "
         f"of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well"
     )
-    lines += [worst_line(summary), f"largest errors (U, k = 2): {_largest(summary)}"]
+    lines += [worst_line(summary), f"largest errors (U, k = 2): {_largest(summary)}", f"holds at: {solution.holds_at}"]
     against = {"look at these runs": solution.flags, "these runs cannot tell": solution.not_observable}
     lines += [f"{word}: {_first(found)}" for word, found in against.items() if found]
     if solution.table_removal is not None:

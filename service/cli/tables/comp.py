@@ -90,13 +90,14 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         sign_files,
         write_files,
     )
+    from abbe.service.verification.reduction import UNKNOWN
 
     doc = _solution(solution, db, machine)
     known = identified(doc)
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
     fresh = _fresh(solution, db, machine, confirmed_none=without_table)
-    made = export(known, form, reference_of(reference), fresh=fresh)
+    made = export(known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN)
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:
         written.append(str(sign_files(out, form, config, seal, SystemClock().utc())))

@@ -75,6 +75,7 @@ def _print_made(store: Store, made: StoredProposal, *, as_json: bool) -> None:
     typer.echo(f"proposal {found.number}: {_promise(found)}")
     for reason in found.reasons:
         typer.echo(f"against it: {reason}")
+    typer.echo(f"holds at: {found.holds_at}")
     for line in found.not_for_tables:
         typer.echo(f"not in the tables: {line}")
     if found.reasons:
@@ -106,7 +107,7 @@ def show_proposals(
         return
     typer.echo(f"proposal {proposal}: {found.state}{': ' if found.why else ''}{found.why}")
     typer.echo(_promise(found))
-    for name in ("machine", "campaign", "solution", "by", "created_utc", "valid_until", "base_crc", "generation", "digest"):
+    for name in ("machine", "campaign", "solution", "by", "created_utc", "valid_until", "holds_at", "base_crc", "generation", "digest"):
         typer.echo(f"{name.replace('_', ' ')}: {getattr(found, name)}")
     for word, lines in (("against it", found.reasons), ("not in the tables", found.not_for_tables)):
         for line in lines:

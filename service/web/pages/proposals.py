@@ -94,6 +94,7 @@ def _facts(found: ProposalDetail) -> list[tuple[str, str]]:
         ("proposal.by", found.by),
         ("proposal.base", found.base_crc),
         ("proposal.valid_until", found.valid_until),
+        ("proposal.holds_at", found.holds_at),
         ("proposal.digest", found.digest),
     ]
 

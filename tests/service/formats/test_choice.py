@@ -103,6 +103,7 @@ def test_backward_column_takes_the_lost_motion_out() -> None:
 def test_control_without_columns_is_told_its_backlash() -> None:
     made = export(_known(), "siemens-840d")
     assert any("X 4.00 µm, Y 6.00 µm, Z -2.00 µm" in note for note in made.notes)
+    assert made.notes[0] == "holds at: unknown: no temperature of the scales is on record or stated"
     assert {f.name for f in made.files} == {"AX_EEC.INI", "NC_CEC.INI"}
 
 
