@@ -15,6 +15,7 @@ from abbe.service.domain.verification import Verification
 from abbe.service.queries.status import Status
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
+from abbe.service.web.path_links import step_address
 from abbe.service.web.strip import strip_of
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
@@ -44,7 +45,7 @@ def environment() -> Environment:
     env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
     # Pictures come from our own SVG writer, which has escaped every text.
     env.filters["picture"] = Markup
-    env.globals |= template_functions()
+    env.globals |= template_functions() | {"step_address": step_address}
     return env
 
 

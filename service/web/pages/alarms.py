@@ -8,6 +8,7 @@ from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from abbe.service.queries.alarm_lines import alarm_lines
+from abbe.service.queries.alarm_path import path_of_alarm
 from abbe.service.queries.status import AlarmSummary, alarms
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission
@@ -48,7 +49,8 @@ def add_alarm_pages(app: FastAPI, context: PageContext) -> None:
         if found is None:
             return await listed() if id is None else await context.missing("alarm", id)
         lines = await context.read(alarm_lines, context.store, status.machine, found.alarm)
-        return await context.show("alarm.html", one=found, lines=lines, now=status.now_utc, line=alarm_line, hours=SHELF_H)
+        way = await context.read(path_of_alarm, context.reader, found.alarm)
+        return await context.show("alarm.html", way=way, one=found, lines=lines, now=status.now_utc, line=alarm_line, hours=SHELF_H)
 
     @app.post("/alarm/acknowledge", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.ACKNOWLEDGE)

@@ -13,6 +13,7 @@ from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.verification import CheckFigure, Verification
 from abbe.service.errors import AbbeError, NotStored
 from abbe.service.queries.alarm_lines import alarms_of_check
+from abbe.service.queries.alarm_path import AlarmPath, path_with
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.results import check as stored_check
 from abbe.service.queries.results import checks
@@ -83,7 +84,12 @@ def add_check_page(app: FastAPI, context: PageContext) -> None:
             screen = await context.read(check_screen, context.reader, number)
         except NotStored:
             return await context.missing("check", number)
-        return await context.show("check.html", screen=screen, marks=MARKS)
+        way = await context.read(_way, context.reader, number)
+        return await context.show("check.html", screen=screen, marks=MARKS, way=way)
+
+
+def _way(reader: Reader, number: int) -> AlarmPath | None:
+    return path_with(reader, "check", number) or path_with(reader, "proof", number)
 
 
 def check_screen(reader: Reader, number: int) -> CheckScreen:

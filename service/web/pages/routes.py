@@ -13,6 +13,7 @@ from pydantic import AfterValidator
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
+from abbe.service.queries.alarm_path import path_with
 from abbe.service.queries.results import discoveries
 from abbe.service.queries.tables import proposals
 from abbe.service.rendering.document_data import shown
@@ -121,7 +122,8 @@ def _add_results(app: FastAPI, context: PageContext) -> None:
         except NotStored:
             return await context.missing("discovery", number or 0)
         report = None if screen is None or screen.document is None else shown(screen.document)
-        return await context.show("discovery.html", screen=screen, report=report)
+        way = None if number is None else await context.read(path_with, context.reader, "cause", number)
+        return await context.show("discovery.html", way=way, screen=screen, report=report)
 
 
 def _add_proposals(app: FastAPI, context: PageContext) -> None:
@@ -145,7 +147,8 @@ def _add_proposals(app: FastAPI, context: PageContext) -> None:
         except Unusable as error:
             return await context.show("changed.html", 409, number=number, text=error.detail)
         key, texts = secrets.token_hex(8), outcome_texts("table.word")
-        return await context.show("proposal.html", screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, texts=texts)
+        way = await context.read(path_with, context.reader, "proposal", number)
+        return await context.show("proposal.html", way=way, screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, texts=texts)
 
 
 def _add_approval(app: FastAPI, context: PageContext) -> None:

@@ -1,0 +1,148 @@
+"""The way from an alarm to a signed report: check, cause, proposal, approval, push, proof, report. It follows from the store alone."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.errors import JournalChanged
+from abbe.service.queries.reader import Reader
+from abbe.service.queries.results import DiscoverySummary, checks, discoveries
+from abbe.service.queries.tables import ProposalSummary, proposals, tables
+from abbe.service.tables.push_journal import PushSummary
+from abbe.service.verification.alarm_states import Alarm, folded
+
+Step = Literal["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
+StepState = Literal["done", "now", "waiting", "failed", "skipped"]
+SEARCHED = ("EXPLAINED", "PROPOSED", "FITTED", "UNEXPLAINED")
+"""States of a search that has told a cause, or that there is none that it knows."""
+APPROVED = ("approved", "pushed", "kept", "rolled back")
+LATEST = 20
+MOST_PATHS = 5
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathStep:
+    """One step. ``number``: of its alarm, check, search, proposal or push, None before it exists; ``recipe``: to measure for it."""
+
+    key: Step
+    state: StepState
+    number: int | None = None
+    recipe: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmPath:
+    """The way of one alarm."""
+
+    alarm: int
+    steps: Sequence[PathStep]
+
+    @property
+    def now(self) -> PathStep | None:
+        """The step that is next; None: everything is done, or a step failed."""
+        return next((step for step in self.steps if step.state == "now"), None)
+
+
+def path_of_alarm(reader: Reader, number: int) -> AlarmPath | None:
+    """The way of an alarm of this service's machine; None: there is no such alarm."""
+    return next((_Facts(reader, entries).path(one) for one, entries in _alarms(reader) if one.number == number), None)
+
+
+def path_with(reader: Reader, key: Step, number: int) -> AlarmPath | None:
+    """The way of the newest alarm that has an object in a step, e.g. a proposal; None: no alarm has."""
+    for one, entries in _alarms(reader)[:MOST_PATHS]:
+        found = _Facts(reader, entries).path(one)
+        if any(step.key == key and step.number == number for step in found.steps):
+            return found
+    return None
+
+
+def _alarms(reader: Reader) -> list[tuple[Alarm, list[AlarmEntryRecord]]]:
+    """The alarms with their entries, newest first."""
+    every = reader.store.alarms.entries(reader.machine)
+    return [(one, [e for e in every if e.alarm == one.number]) for one in reversed(folded(every))]
+
+
+class _Facts:
+    """What the store holds about the way of one alarm. What the service recorded for it counts first, then what came after it."""
+
+    def __init__(self, reader: Reader, entries: Sequence[AlarmEntryRecord]) -> None:
+        self._reader, self._entries = reader, entries
+
+    def path(self, alarm: Alarm) -> AlarmPath:
+        found = list(self._steps(alarm))
+        first = next((k for k, (_, state, _, _) in enumerate(found) if state == "waiting"), len(found))
+        late = any(state == "failed" for _, state, _, _ in found[:first])
+        steps = [
+            PathStep(key=key, state="now" if k == first and not late else state, number=number, recipe=recipe)
+            for k, (key, state, number, recipe) in enumerate(found)
+        ]
+        return AlarmPath(alarm=alarm.number, steps=steps)
+
+    def _steps(self, alarm: Alarm) -> Iterator[tuple[Step, StepState, int | None, str]]:
+        proposal, search = self._proposal(alarm), self._search(alarm)
+        push, proof = self._push(proposal), self._cleared()
+        later: StepState = "waiting" if alarm.active or proposal is not None else "skipped"
+        failed = alarm.last(AlarmKind.ENDED) is not None and proposal is None
+        yield "alarm", "done" if alarm.acknowledged_by else "waiting", alarm.number, ""
+        yield "check", "done", self._raising(alarm), ""
+        told = search is not None and search.state in SEARCHED
+        yield (
+            "cause",
+            "done" if told or proposal is not None else "failed" if failed else later,
+            None if search is None else search.number,
+            "",
+        )
+        number = None if proposal is None else proposal.number
+        yield "proposal", "done" if proposal is not None else "failed" if failed else later, number, ""
+        state = "" if proposal is None else proposal.state
+        against = state in {"refused", "rejected", "expired", "superseded", "changed"}
+        yield "approval", "done" if state in APPROVED else "failed" if against else later, number, ""
+        word = "" if push is None else push.word
+        bad = word in {"rolled back", "refused", "failed", "stopped", "interrupted"}
+        yield "push", "done" if word == "kept" else "failed" if bad else later, None if push is None else push.push, ""
+        proof = proof or (None if push is None or word != "kept" else self._check_after(alarm, push))
+        yield "proof", "done" if proof is not None else "waiting", proof, alarm.recipe
+        yield "report", "waiting", proof, ""
+
+    def _raising(self, alarm: Alarm) -> int:
+        """The latest check that raised or held the alarm."""
+        kinds = (AlarmKind.RAISED, AlarmKind.CONTINUED)
+        held = [e.doc["verification"] for e in self._entries if e.kind in kinds]
+        return int(held[-1]) if held else alarm.verification
+
+    def _cleared(self) -> int | None:
+        return next((int(e.doc["verification"]) for e in self._entries if e.kind is AlarmKind.CLEARED), None)
+
+    def _search(self, alarm: Alarm) -> DiscoverySummary | None:
+        told = alarm.last(AlarmKind.DISCOVERED)
+        known = None if told is None else told.doc.get("discovery")
+        found = discoveries(self._reader, None, self._reader.machine, None, LATEST)[0]
+        return next((one for one in found if one.number == known or (known is None and one.created_utc > alarm.raised_utc)), None)
+
+    def _proposal(self, alarm: Alarm) -> ProposalSummary | None:
+        told = alarm.last(AlarmKind.PROPOSED)
+        known = None if told is None else told.doc.get("proposal")
+        found = proposals(self._reader, self._reader.machine, None, LATEST)[0]
+        return next((one for one in found if one.number == known or (known is None and one.created_utc > alarm.raised_utc)), None)
+
+    def _push(self, proposal: ProposalSummary | None) -> PushSummary | None:
+        if proposal is None:
+            return None
+        try:
+            found = tables(self._reader).pushes
+        except JournalChanged:
+            return None
+        return next((push for push in found if push.proposal == proposal.number), None)
+
+    def _check_after(self, alarm: Alarm, push: PushSummary) -> int | None:
+        """The first check of the alarm's recipe that passed after a push."""
+        later = [
+            one.id
+            for one in checks(self._reader, self._reader.machine, "pass", None, LATEST)[0]
+            if one.recipe == alarm.recipe and not one.push and one.started_utc.isoformat() > push.ended
+        ]
+        return min(later, default=None)

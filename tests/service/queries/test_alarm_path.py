@@ -1,0 +1,76 @@
+"""The way from an alarm to a report follows from the store alone, step by step, and can be taken up again at any of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import pytest
+
+from abbe.service.clock import SystemClock
+from abbe.service.compensation.proposal_decisions import approve
+from abbe.service.domain.service_records import AlarmKind
+from abbe.service.queries.alarm_path import path_of_alarm, path_with
+from abbe.service.queries.reader import Reader
+from abbe.service.storage.store import Store
+from abbe.service.verification.alarms import acknowledge
+from abbe.service.web.path_links import step_address
+from tests.pages_world import Filled, filled_once
+from tests.pretended_push import KEPT, as_if_pushed
+
+
+@pytest.fixture
+def filled(tmp_path_factory: pytest.TempPathFactory) -> Filled:
+    return filled_once(tmp_path_factory)
+
+
+@pytest.fixture
+def reader(filled: Filled) -> Iterator[Reader]:
+    with Store.open(filled.url) as store:
+        yield Reader(store, filled.machine, SystemClock())
+
+
+def states(reader: Reader, number: int) -> dict[str, str]:
+    way = path_of_alarm(reader, number)
+    assert way is not None
+    return {step.key: step.state for step in way.steps}
+
+
+def to_do(reader: Reader, number: int) -> str:
+    """Where the one button of the way leads."""
+    way = path_of_alarm(reader, number)
+    assert way is not None
+    return "" if way.now is None else step_address(way.now, to_do=True)
+
+
+async def test_from_the_alarm_to_the_report(reader: Reader, filled: Filled) -> None:
+    store, proposal = reader.store, filled.proposals[2]
+    assert to_do(reader, 2) == "/alarm?id=2"
+    acknowledge(store, filled.machine, 2, "olga")
+    assert to_do(reader, 2) == f"/proposal?id={proposal}"
+    approve(store, proposal, "anna", 1.0, SystemClock(), "user:anna")
+    assert states(reader, 2) | {"push": "now", "approval": "done"} == states(reader, 2)
+    await as_if_pushed(store, SystemClock(), filled.machine, {"proposal": proposal}, (b"June", b"July"), KEPT)
+    assert states(reader, 2) | {"push": "done", "proof": "now"} == states(reader, 2)
+    assert to_do(reader, 2) == "/new?recipe=quick-check"
+    store.alarms.append(
+        filled.machine, 2, 3, AlarmKind.CLEARED, {"verification": 20, "signals": [], "text": "pass", "recipe": "quick-check"}
+    )
+    assert to_do(reader, 2) == "/api/v1/reports/verification/20"
+    for key, number in (("check", 24), ("proposal", proposal), ("proof", 20)):
+        found = path_with(reader, key, number)  # type: ignore[arg-type]
+        assert found is not None
+        assert found.alarm == 2
+    assert path_with(reader, "check", 1) is None
+
+
+def test_without_a_proposal_the_cause_is_to_be_measured_or_nothing_is_needed(reader: Reader, filled: Filled) -> None:
+    store = reader.store
+    first = next(e for e in store.alarms.entries(filled.machine) if e.kind == "raised")
+    number = store.alarms.append(filled.machine, None, 0, AlarmKind.RAISED, first.doc).alarm
+    acknowledge(store, filled.machine, number, "olga")
+    assert to_do(reader, number) == "/new?recipe=identification"
+    store.alarms.append(filled.machine, number, 2, AlarmKind.ENDED, {"text": "no proposal: nothing is known"})
+    assert states(reader, number) | {"cause": "failed", "approval": "waiting"} == states(reader, number)
+    assert to_do(reader, number) == ""
+    store.alarms.append(filled.machine, number, 3, AlarmKind.CLEARED, {"verification": 20, "signals": [], "text": "pass"})
+    assert states(reader, number) | {"approval": "skipped", "push": "skipped", "proof": "done"} == states(reader, number)
