@@ -110,7 +110,7 @@ def _noise(taken: list[Sample], file: DeviceFile | None) -> list[Finding]:
     found = []
     for name in taken[0].values:
         values = [sample.values[name] for sample in taken]
-        unit, scale = ("um", 1e3) if name in ("displacement", "x", "y", "z") else ("", 1.0)
+        unit, scale = ("um", 1e3) if name in ("displacement", "radius", "x", "y", "z") else ("", 1.0)
         if not all(map(math.isfinite, values)):
             found.append(Finding(f"noise {name}", FAILED, "a reading is not a number"))
             continue
@@ -134,7 +134,8 @@ async def motion(probe: Probe, file: DeviceFile | None, move: Move, ask: Ask) ->
 async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, ask: Ask) -> Finding:
     about, what = f"{move.mm:g} +- {move.tolerance_mm:g} mm", f"motion {name}"
     before, before_words = await _mean(probe, name), await _words(probe, name)
-    await ask(f"Move the target {about} AWAY FROM the instrument." if name == "displacement" else f"Move axis {name.upper()} by +{about}.")
+    done = {"displacement": f"Move the target {about} AWAY FROM the instrument.", "radius": f"Pull the bar {about} OUT."}
+    await ask(done.get(name, f"Move axis {name.upper()} by +{about}."))
     after, after_words = await _mean(probe, name), await _words(probe, name)
     got = after - before
     wrong = wrong_motion(got, move)

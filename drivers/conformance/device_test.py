@@ -9,7 +9,7 @@ from urllib.parse import urlsplit
 from abbe.drivers.api import DeviceInfo
 from abbe.drivers.conformance.checks import Ask, Move, identity, motion, quality, rate
 from abbe.drivers.conformance.faults import faults
-from abbe.drivers.conformance.probe import ControlProbe, MeterProbe, Probe, SourceProbe
+from abbe.drivers.conformance.probe import BarProbe, ControlProbe, MeterProbe, Probe, SourceProbe
 from abbe.drivers.conformance.proxy import Proxy
 from abbe.drivers.described.control import ListenedControl
 from abbe.drivers.described.meter import DescribedMeter
@@ -18,18 +18,20 @@ from abbe.drivers.described.tested import Ability, Finding, TestReport, Verdict
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import BadUrl, DriverError
 from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, SocketUrl, described_by, installed, parse_url
-from abbe.drivers.registry import open_controller, open_laser
+from abbe.drivers.registry import open_ballbar, open_controller, open_laser
 
 LATE_SHARE = 1.5
 """A late reply comes after this many reply timeouts."""
 OWN_TIMEOUT_S = 1.0
 AT_REST_MM = 0.002
-POSITIONS = ("motion x", "motion y", "motion z")
+_METER, _CONTROL = ("motion displacement",), ("motion x", "motion y", "motion z")
+MOTIONS = {"displacement": _METER, "laser": _METER, "ballbar": ("motion radius",), "position": _CONTROL, "cnc": _CONTROL}
+"""Known motions that must have been made before readings of a kind count."""
 
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a device is tested: ``role`` of a device with a driver (laser or cnc); ``move``, ``ask``: None without a person beside it."""
+    """How a device is tested. ``role``: of a device with a driver, laser, ballbar or cnc; ``move``, ``ask``: None without a person."""
 
     role: str = "laser"
     move: Move | None = None
@@ -94,8 +96,8 @@ def abilities(kind: str, found: tuple[Finding, ...]) -> tuple[Ability, ...]:
     if any(one.verdict is Verdict.FAILED for one in found):
         return ()
     passed = {one.check for one in found if one.verdict is Verdict.PASSED}
-    needed = {"freshness", *(POSITIONS if kind in ("position", "cnc") else ("motion displacement",))}
-    counts = kind in ("displacement", "laser", "position", "cnc") and needed <= passed
+    needed = MOTIONS.get(kind, ())
+    counts = bool(needed) and {"freshness", *needed} <= passed
     return (Ability.WATCH, Ability.DWELL) if counts else (Ability.WATCH,)
 
 
@@ -117,7 +119,9 @@ def _opener(text: str, about: Described | None, role: str) -> Callable[[], Await
             return MeterProbe(await open_laser(text))
         if role == "cnc":
             return ControlProbe(await open_controller(text))
-        raise BadUrl(ascii(text), "test device", f"there is no test for the role {role!r}", "use laser or cnc")
+        if role == "ballbar":
+            return BarProbe(await open_ballbar(text))
+        raise BadUrl(ascii(text), "test device", f"there is no test for the role {role!r}", "use laser, ballbar or cnc")
 
     return by_driver
 
@@ -145,7 +149,7 @@ async def _faults(text: str, about: Described | None, role: str) -> list[Finding
         else:
             url = parse_url(text) if about is None else about.url
             if isinstance(url, FixtureTcpUrl | FixtureConsoleUrl):
-                raise BadUrl(ascii(text), "test device", "a fixture has no test", "use laser or cnc")
+                raise BadUrl(ascii(text), "test device", "a fixture has no test", "test laser, ballbar and cnc")
             there = await proxy.front(url)
             opener = _opener(str(there), None if about is None else Described(there, about.file, about.sha256), role)
         return await faults(opener, proxy, close_mm)

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import statistics
+from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 
 from abbe.drivers.conformance.probe import Probe, Sample
 from abbe.drivers.conformance.proxy import Fault, Proxy
@@ -15,6 +17,21 @@ TRIES = 6
 RECOVERS_S = 15.0
 """Longest time until a reading is right again."""
 PAUSE_S = 0.2
+AT_REST, NOISES = 10, 10.0
+"""Readings before the first fault, and how many of their standard deviations a right reading may be off."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """What a device reads at rest: number of the last reading, mean values, and how far from them a right reading may be."""
+
+    number: int
+    values: Mapping[str, float]
+    close: Mapping[str, float]
+
+    def off(self, sample: Sample) -> dict[str, float]:
+        """Values of a sample that cannot be those at rest."""
+        return {key: value for key, value in sample.values.items() if not abs(value - self.values[key]) <= self.close[key]}
 
 
 async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm: float) -> list[Finding]:
@@ -25,7 +42,7 @@ async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm
     open_at : callable
         Opens the device behind the proxy.
     close_mm : float
-        How far from the first reading a reading at rest may be, mm or degree C.
+        How far from the mean a right reading at rest may be at least, mm or degree C; noise widens it.
     """
     try:
         probe = await open_at()
@@ -33,8 +50,8 @@ async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm
         return [Finding("replies", Verdict.FAILED, f"the device cannot be opened behind a proxy: {error}")]
     try:
         await probe.zero()
-        base = await probe.sample(None)
-        found = [await _played(probe, proxy, fault, base, close_mm) for fault in Fault if fault is not Fault.CUT or proxy.cuts]
+        base = await _rest(probe, close_mm)
+        found = [await _played(probe, proxy, fault, base) for fault in Fault if fault is not Fault.CUT or proxy.cuts]
         return found if proxy.cuts else [*found, Finding(Fault.CUT.value, Verdict.NOT_PROVED, "a serial line has none: pull its plug")]
     except DriverError as error:
         return [Finding("replies", Verdict.FAILED, str(error))]
@@ -42,7 +59,7 @@ async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm
         await probe.close()
 
 
-async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: Sample, close_mm: float) -> Finding:
+async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: _Rest) -> Finding:
     name, before, refused, number = f"reply {fault.value}" if fault is not Fault.CUT else fault.value, proxy.done, "", base.number
     clock = asyncio.get_running_loop().time
     begun_s, good = clock(), 0
@@ -57,12 +74,20 @@ async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: Sample, close_
             await asyncio.sleep(PAUSE_S)
             await _zeroed(probe)
             continue
-        off = {key: value for key, value in sample.values.items() if not abs(value - base.values[key]) <= close_mm}
-        if off:
+        if off := base.off(sample):
             return Finding(name, Verdict.FAILED, f"a wrong reading passed as right: {off}, at rest it was {dict(base.values)}")
         number, good = sample.number, good + 1
     took = f"right again after {clock() - begun_s:.1f} s"
     return Finding(name, Verdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right")
+
+
+async def _rest(probe: Probe, least: float) -> _Rest:
+    taken: list[Sample] = []
+    for _ in range(AT_REST):
+        taken.append(await probe.sample(taken[-1].number if taken else None))
+    columns = {key: [sample.values[key] for sample in taken] for key in taken[0].values}
+    close = {key: max(least, NOISES * statistics.pstdev(values)) for key, values in columns.items()}
+    return _Rest(taken[-1].number, {key: statistics.fmean(values) for key, values in columns.items()}, close)
 
 
 async def _zeroed(probe: Probe) -> None:

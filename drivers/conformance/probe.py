@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+import time
+from collections.abc import AsyncIterator, Mapping
+from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
 from typing import Protocol
 
-from abbe.drivers.api import Controller, DeviceInfo, DisplacementMeter
+from abbe.drivers.api import BallBar, BarBatch, Controller, DeviceInfo, DisplacementMeter, bar_is_valid, bar_reasons
 from abbe.drivers.described.source import Source, physical
 from abbe.drivers.device_file import DeviceFile
+from abbe.drivers.errors import DeviceFault, DriverError
 
 MM_PER_COUNT = 1e-7
+BAR_RATE_HZ = 100
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,6 +97,50 @@ class ControlProbe:
 
     async def close(self) -> None:
         await self._control.close()
+
+
+class BarProbe:
+    """A ball-bar's stream; a sample is the newest that arrives after it was asked for."""
+
+    moved: tuple[str, ...] = ("radius",)
+
+    def __init__(self, bar: BallBar) -> None:
+        self._bar = bar
+        self.name = bar.name
+        self._open = AsyncExitStack()
+        self._batches: AsyncIterator[BarBatch] | None = None
+
+    async def identify(self) -> DeviceInfo:
+        return await self._bar.identify()
+
+    async def zero(self) -> None:
+        return
+
+    async def sample(self, after: int | None) -> Sample:
+        try:
+            if self._batches is None:
+                self._batches = await self._open.enter_async_context(self._bar.stream(BAR_RATE_HZ))
+            asked_s = time.monotonic()
+            while (batch := await anext(self._batches)).host_s < asked_s:
+                pass
+        except DriverError:
+            self._batches = None
+            with suppress(DriverError):  # the first error says what happened
+                await self._open.aclose()
+            raise
+        seq, device_us, reading_nm, status = batch.samples[-1]
+        if not bar_is_valid(status):
+            raise DeviceFault(self.name, "read", ", ".join(bar_reasons(status)), "hang the bar in, move into its range")
+        return Sample(batch.host_s, device_us * 1e-6, seq, {"radius": reading_nm * 1e-6})
+
+    async def raw(self) -> Mapping[str, tuple[int, ...]]:
+        return {}
+
+    async def close(self) -> None:
+        self._batches = None
+        with suppress(DriverError):
+            await self._open.aclose()
+        await self._bar.close()
 
 
 class SourceProbe:

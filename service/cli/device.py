@@ -26,10 +26,23 @@ def list_files(as_json: JsonOption = False) -> None:
     conclude("abbe doctor", verdict=f"{len(found)} device files")
 
 
+@device.command("show")
+def show_file(
+    name: Annotated[str, typer.Argument(metavar="NAME", help="As `abbe device list` names it.")], as_json: JsonOption = False
+) -> None:
+    """Print a device file, to copy and change it: `abbe device show dial-gauge --out my-gauge.toml`."""
+    from abbe.drivers.device_file import find, load
+
+    file, _ = load(name)
+    wire = "modbus+tcp" if file.modbus is not None else "socket"
+    answer({"name": name, "toml": (text := find(name).read_text(encoding="utf-8"))}, text.rstrip("\n"), as_json=as_json)
+    conclude(f"abbe device test {quote(f'{wire}://HOST:PORT?device={name}')} --move 10", as_json=as_json)
+
+
 @device.command("test")
 def try_device(
     url: Annotated[str, typer.Argument(metavar="URL", help="Address of the device as in [devices], with device=FILE if one describes it.")],
-    role: Annotated[str, typer.Option(help="Of a device with a driver: laser or cnc.")] = "laser",
+    role: Annotated[str, typer.Option(help="Of a device with a driver: laser, ballbar or cnc.")] = "laser",
     move: Annotated[float, typer.Option(metavar="MM", help="Known motion, mm, that a person makes when asked; 0: none.")] = 0.0,
     tolerance: Annotated[float, typer.Option(metavar="MM", help="How exactly that motion is known, mm.")] = 0.05,
     faults: Annotated[bool, typer.Option("--faults/--no-faults", help="Play late, doubled, spoilt and missing replies.")] = True,

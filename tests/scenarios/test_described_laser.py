@@ -76,3 +76,26 @@ def test_it_is_tested_and_measures(command, start_sims, tmp_path):
     assert all(columns["valid"])
     assert np.abs(columns["deviation_mm"]).max() < 0.1
     assert np.ptp(columns["temp_air_C"]) < 1.0
+
+
+async def bar_report(sims):
+    urls = tomllib.loads(sims.machine_file.read_text())["devices"]
+    async with open_session(DeviceUrls(cnc=urls["cnc"], fixture=urls["fixture"])) as session:
+        await session.controller.move((300.0, 200.0, 200.0), feed_mm_min=6000.0, timeout_s=60.0)
+        await session.need_fixture().mount_ballbar(100.0)
+        await session.controller.move((400.0, 200.0, 200.0), feed_mm_min=6000.0, timeout_s=60.0)
+
+        async def person(text: str) -> None:
+            x = 400.5 if "OUT" in text else 400.0
+            await session.controller.move((x, 200.0, 200.0), feed_mm_min=1000.0, timeout_s=30.0)
+
+        report = await device_test(urls["ballbar"], Options("ballbar", Move(0.5, 0.01), person), "2026-11-26T00:00:00+00:00")
+        await session.need_fixture().unmount()
+    return report
+
+
+def test_the_ballbar_passes_the_same_test_over_a_line_that_loses_and_doubles(start_sims):
+    report = asyncio.run(bar_report(start_sims("--seed", "4")))
+    assert report.failed == ()
+    assert report.abilities == (Ability.WATCH, Ability.DWELL)
+    assert {one.check for one in report.findings} >= {"motion radius", "reply late", "reply doubled", "reply spoilt", "reply missing"}

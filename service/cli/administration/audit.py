@@ -103,6 +103,7 @@ READS = frozenset(
         "errors",
         "check-config",
         "device list",
+        "device show",
         "device test",
         "doctor",
         "init",

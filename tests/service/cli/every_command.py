@@ -36,6 +36,7 @@ CASES: dict[str, Case] = {
     "listen": Case("listen", "solve", "listen --recipe none.toml", "CFG-001", (0,), f"{SCENARIOS}/test_listen.py"),
     "sim": Case("sim", "doctor", "sim --machine-file abbe.toml", "CFG-001", (0,), "tests/service/cli/test_setting_up.py"),
     "device list": Case("device list", "doctor", "device list x", "USE-001"),
+    "device show": Case("device show dial-gauge", "device test", "device show none", "DRV-012"),
     "device test": Case("device test", "doctor", "device test nonsense", "DRV-001", (0, 1), "tests/service/cli/test_setting_up.py"),
     "runs": Case("runs", "show c1/", "runs --db nonsense", "STO-001"),
     "show": Case("show june", "solve june", "show none", "STO-002"),

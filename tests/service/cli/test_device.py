@@ -56,6 +56,11 @@ def test_the_shipped_files_are_listed(capsys: pytest.CaptureFixture[str]) -> Non
     assert {one["kind"] for one in listed} == {"displacement", "position", "temperature"}
 
 
+def test_a_shipped_file_is_printed_to_be_changed(tmp_path: Path) -> None:
+    assert run(["device", "show", "dial-gauge", "--out", str(tmp_path / "mine.toml")]) == 0
+    assert (tmp_path / "mine.toml").read_text() == (SHIPPED / "dial-gauge.toml").read_text()
+
+
 def test_without_a_known_motion_a_device_is_only_shown_and_the_report_says_so(
     gauge: Gauge, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
