@@ -206,7 +206,7 @@ def test_a_dry_run() -> None:
         assert f'<td class="n">{run.path_mm / IN:.2f}</td><td class="n">{run.fastest_mm_min / IN:.2f}</td>' in row
     for one in dry.set_ups:
         assert "X {:.3f} Y {:.3f} Z {:.3f} in".format(*(v / IN for v in one.at_mm)) in page
-    assert f"Bar of {dry.set_ups[0].radius_mm / IN:.2f} in at hand" in page
+    assert f"Bar of {dry.set_ups[0].radius_mm / IN:.2f} in, cup at" in page
     assert ("[in]" in page, "[in/min]" in page, re.search(r"\bmm\b", page)) == (True, True, None)
     # What the full campaign has mounted is told, not ticked off.
     full = PLANS.run(CAMPAIGN, 100, Unit("in", IN))
