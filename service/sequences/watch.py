@@ -18,7 +18,7 @@ from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Itera
 from contextlib import ExitStack, asynccontextmanager, contextmanager, suppress
 from datetime import timedelta
 from functools import partial
-from typing import Any
+from typing import Any, Self
 
 from abbe.drivers.api import ControllerStatus, DisplacementMeter
 from abbe.drivers.errors import NO_RUN, DriverError, Rebooted, on_behalf_of, run_to_end
@@ -35,6 +35,8 @@ LASER_UNKNOWN_S = 2.5
 RETRY_S = 0.02
 LATE_S = 0.1
 """A wake-up that is later than this, s, means that this computer stalled: the watcher asks once more before it calls the status unknown."""
+LOOK_S = 0.05
+"""Time between two looks whether this computer stalls."""
 NOTHING: frozenset[str] = frozenset()
 END_S = 5.0
 """Longest wait for the watchers' current poll when the test has ended."""
@@ -228,32 +230,56 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
     Raises
     ------
     StatusUnknown
-        No reply within ``unknown_s``. A stall of this computer does not count against the controller.
+        No reply within ``unknown_s``. If this computer stalled meanwhile, even if the stall ended before that, the controller gets the time
+        once more.
     Rebooted
         The controller restarted.
     """
     clock = asyncio.get_running_loop().time
     until_s = clock() + unknown_s
     why, again = "no answer", True
-    while True:
-        try:
-            async with asyncio.timeout_at(until_s):
-                return await ask()
-        except Rebooted:
-            raise
-        except (DriverError, TimeoutError) as error:
-            if isinstance(error, DriverError):
-                why = str(error)
-        late_s = clock() - until_s
-        if late_s > LATE_S and again:
-            until_s, again = clock() + unknown_s, False
-        elif late_s >= 0.0:
-            raise StatusUnknown(
-                f"the controller's status has been unknown for {1e3 * unknown_s:.0f} ms: {why}",
-                "look at the controller's link; nothing moves until its status is known",
-            )
-        else:
-            await asyncio.sleep(min(RETRY_S, -late_s))
+    with Stalls() as stalls:
+        while True:
+            try:
+                async with asyncio.timeout_at(until_s):
+                    return await ask()
+            except Rebooted:
+                raise
+            except (DriverError, TimeoutError) as error:
+                if isinstance(error, DriverError):
+                    why = str(error)
+            late_s = clock() - until_s
+            if late_s < 0.0:
+                await asyncio.sleep(min(RETRY_S, -late_s))
+            elif again and max(late_s, stalls.longest_s) > LATE_S:
+                until_s, again = clock() + unknown_s, False
+            else:
+                raise StatusUnknown(
+                    f"the controller's status has been unknown for {1e3 * unknown_s:.0f} ms: {why}",
+                    "look at the controller's link; nothing moves until its status is known",
+                )
+
+
+class Stalls:
+    """While it is open: ``longest_s``, the longest time, s, that this computer did not let the event loop run. It looks every `LOOK_S`."""
+
+    def __init__(self) -> None:
+        self.longest_s = 0.0
+        self._loop = asyncio.get_running_loop()
+
+    def __enter__(self) -> Self:
+        self._look_again()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._look.cancel()
+
+    def _look_again(self) -> None:
+        self._look = self._loop.call_at(self._loop.time() + LOOK_S, self._looked, self._loop.time() + LOOK_S)
+
+    def _looked(self, due_s: float) -> None:
+        self.longest_s = max(self.longest_s, self._loop.time() - due_s)
+        self._look_again()
 
 
 def first_of(error: BaseException) -> BaseException:

@@ -181,7 +181,7 @@ def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_u
 
 SCHEDULE = """[[schedule]]
 name = "daily"
-recipe = "quick-check at 20 Hz"
+recipe = "quick-check at 10 Hz"
 cron = "0 3 * * *"
 [web]
 port = 0
@@ -211,7 +211,7 @@ every run plays three of them."""
 def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_command(command, killed, tmp_path, words, codes):
     machine = killed.machine(tmp_path, "mill-A", more=SCHEDULE)
     code, out, err = command(*(machine if word == "MACHINE" else word for word in words))
-    assert code in codes, (out, err)
+    assert code in codes, f"exit code {code}\nstdout:\n{out}\nstderr:\n{err}"
     assert table(killed.sims) == killed.before
     if words[0] != "serve":
         assert "push 1 was not verified (interrupted before it was verified); the old table was made active again" in err

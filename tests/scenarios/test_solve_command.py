@@ -106,7 +106,7 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(command, folder):
     truth = draw_case(SEED, "one_tool").truth
     for name in ("backlash_X", "backlash_Y", "backlash_Z"):
         found = doc["parameters"][name]
-        assert abs(found["value"] - truth.parameter(name)) < 4 * found["u"]
+        assert abs(found["value"] - truth.parameters([name])[0]) < 4 * found["u"]
     worst = doc["uncertainty"]["worst_point"]
     assert worst["expanded_vector_um"] >= max(worst["expanded_um"])
     machine = machine_from_doc(doc["machine"])
