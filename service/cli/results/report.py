@@ -85,12 +85,22 @@ def report(  # noqa: PLR0913 - one argument for each option
     doc = {"files": [str(target) for target in targets], "title": document.title, "verdict": word, "text": text}
     lines = [*(f"report: {target}" for target in targets), f"{document.title}: {word}. {text}".strip(), *reduced]
     answer(doc, *lines, as_json=as_json)
-    conclude(
-        "abbe trend" if what in NUMBERED else f"abbe solve {quote(what)}",
-        machine=machine,
-        db=None if what in NUMBERED else db,
-        as_json=as_json,
-    )
+    if what not in NUMBERED and _identifies(what, url):
+        conclude(f"abbe solve {quote(what)}", machine=machine, db=db, as_json=as_json)
+    else:
+        conclude("abbe trend", machine=machine, as_json=as_json)
+
+
+def _identifies(what: str, url: str) -> bool:
+    """Return whether a campaign, folder or run has runs to solve: a check has none."""
+    from abbe.service.campaign_data.campaign_folder import is_folder
+    from abbe.service.domain.measured import RunRecord
+
+    if is_folder(what):
+        return True
+    with open_store(url) as store:
+        found = run_or_campaign(store, what)
+        return not isinstance(found, RunRecord) and any(run.role == "identify" for run in store.runs.all(found.id))
 
 
 def _day(text: str | None) -> date | None:
