@@ -175,6 +175,7 @@ def solve(
         The data of a run, bar or mirror contradict its description; the message names it and the remedy.
     """
     known = remove_effects(None, campaign, campaign_table(None, campaign))
-    solved = solve_runs(campaign.site, known.campaign.runs, model=model, progress=progress)
+    tools = campaign.doc.get("instruments")
+    solved = solve_runs(campaign.site, known.campaign.runs, model=model, instruments=tools, progress=progress)
     found = assess(solved, unknown_table=bool(known.not_removed))
     return Solution(campaign, found, table_line(known.in_force) if known.in_force is not None else known.not_removed)

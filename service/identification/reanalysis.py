@@ -115,7 +115,8 @@ def solve_task(task: ReanalysisTask) -> ReanalysisResult:
         with Store.open(task.url) as store:
             measured = from_store(store, task.campaign)
             known = remove_effects(store, measured, campaign_table(store, measured))
-        solved = solve_runs(known.campaign.site, known.campaign.runs, model=task.model)
+        tools = known.campaign.doc.get("instruments")
+        solved = solve_runs(known.campaign.site, known.campaign.runs, model=task.model, instruments=tools)
         found = assess(solved, unknown_table=bool(known.not_removed))
         doc = {"campaign": known.campaign.name, "machine": known.campaign.site.doc} | solution_doc(found) | known.doc
         return ReanalysisResult(task.campaign, doc)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -18,12 +18,14 @@ from abbe.models.solvers.observations import RunData, bar_normals, nominal_readi
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
+from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, check_readings, copy_issues, refuse
 from abbe.service.campaign_data.provenance import measured_digest, removals_of
 from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
+from abbe.service.verification.iso_report import laser_inputs
 from abbe.service.verification.reduction import holds_at
 
 LASER_SIGMA_MM = 3e-4
@@ -61,7 +63,7 @@ class Solved:
     ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
     ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
-    temperature of the scales at which the result holds, as text.
+    temperature of the scales at which the result holds, as text. ``inputs``: stated uncertainties that no reading shows.
     """
 
     joint: JointSolution
@@ -74,10 +76,20 @@ class Solved:
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
     removed: tuple[str, ...] = ()
     holds_at: str = ""
+    inputs: StatedInputs = field(default_factory=StatedInputs)
 
 
-def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", progress: ProgressText | None = None) -> Solved:
+def solve_runs(
+    site: Site,
+    runs: list[Run],
+    *,
+    model: Model | None = "rigid21",
+    instruments: dict[str, Any] | None = None,
+    progress: ProgressText | None = None,
+) -> Solved:
     """Solve runs of the role ``identify`` together, after checking each for consistency.
+
+    ``instruments``: those of the campaign file; what they do not know of laser and scales widens the uncertainties (`laser_inputs`).
 
     ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it or cannot carry it (`map_against_prior`).
 
@@ -101,19 +113,19 @@ def solve_runs(site: Site, runs: list[Run], *, model: Model | None = "rigid21", 
     bars = [r for r in used if r.is_bar]
     noise = float(np.median([bar_noise_mm(r) for r in bars])) if bars else 5e-4
     data = tuple(run_data(r) for r in used)
-    joint = solve_joint(site.machine, data, model=model, progress=progress)
+    inputs = laser_inputs(instruments or {})
+    priors = replace(Priors(), laser_scale=inputs.u_wavelength)
+    joint = solve_joint(site.machine, data, model=model, priors=priors, progress=progress)
     if beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else ""):
         flags.append(beyond)
-        joint = solve_joint(site.machine, data, model="rigid6", progress=progress) if free else joint
+        joint = solve_joint(site.machine, data, model="rigid6", priors=priors, progress=progress) if free else joint
     flags += check_instruments(joint, data)
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     digests = {r.run_id: measured_digest(r) for r in used}
     tables = {r.run_id: r.table.document for r in used if r.table.crc is not None}
-    return Solved(
-        joint, helices, step_diagonals(used), noise, tuple(flags), digests, value_rows(used, data), tables, tuple(removals_of(used)),
-        holds_at(used, site.materials),
-    )  # fmt: skip
+    rows, removed, held = value_rows(used, data), tuple(removals_of(used)), holds_at(used, site.materials)
+    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, rows, tables, removed, held, inputs)
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:

@@ -155,7 +155,7 @@ def assess(solved: Solved, *, unknown_table: bool = False) -> Assessment:
     if unknown_table:
         solved = replace(solved, joint=with_unknown_table(solved.joint))
     joint = solved.joint
-    sources = error_sources(joint)
+    sources = error_sources(joint, solved.inputs)
     prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))
     return Assessment(
         solved,

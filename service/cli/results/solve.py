@@ -198,7 +198,13 @@ def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tup
         def report_stage(text: str) -> None:
             sink(Progress("solve", float(next(stages, STAGES - 1)), float(STAGES), None, text))
 
-        solved = solve_runs(campaign.site, campaign.runs, model=None if wanted.model is None else wanted.model.value, progress=report_stage)
+        solved = solve_runs(
+            campaign.site,
+            campaign.runs,
+            model=None if wanted.model is None else wanted.model.value,
+            instruments=campaign.doc.get("instruments"),
+            progress=report_stage,
+        )
         report_stage("what these runs cannot tell, and how well the volume is known")
         summary = assess(solved, unknown_table=bool(known.not_removed))
         solution = solution_of(summary).model_copy(update=_more(summary, wanted, report_stage))

@@ -76,6 +76,22 @@ def test_an_answer_takes_the_place_of_what_the_file_lacks(abbe: Abbe) -> None:
     assert not any("feed" in line for line in found["remarks"])
 
 
+def test_a_solution_counts_it_too(abbe: Abbe) -> None:
+    targets = [50.0 * k for k in range(11)]
+    runs = [[round(-0.02 * t + 2.5 * (k % 2) + 0.1 * ((7 * k + t / 50) % 5), 1) for t in targets] for k in range(10)]
+    Path("long.rtl").write_text(renishaw(runs, targets))
+    given = ("--scale-temperature", "20", "--air-temperature", "20", "--air-pressure", "1013")
+    length, scales = {}, {}
+    for name, options in (("unknown", ()), ("known", given)):
+        assert abbe("import", "long.rtl", "--yes", "--name", name, *options).code == 0
+        solved = json.loads(abbe("solve", name, "--model", "rigid6", "--json").out)
+        length[name] = solved["mean_over_volume"]["EXX"]["u"]
+        (scales[name],) = [one["u_um"] for one in solved["uncertainty"]["budget"] if one["source"] == "scale_temperature"]
+    assert length["unknown"] > 5e-6
+    assert length["known"] < 1e-6
+    assert scales["unknown"] == pytest.approx(scales["known"] * 10.0 / 12.0**0.5 / 0.2)
+
+
 def test_a_machine_file_gives_chain_strokes_and_reduction_to_20_degrees(abbe: Abbe) -> None:
     material = "[material]\ntemperature_c = 24.0\n[material.scale_per_k]\nX = 11.5e-6\n[material.u_scale_per_k]\nX = 0.5e-6\n"
     Path("mill.toml").write_text(MACHINE_FILE + material)
