@@ -12,12 +12,15 @@ import sqlite3
 import subprocess
 from contextlib import closing
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pytest
 
 from abbe.drivers.registry import open_controller
+from abbe.service.sequences.control import Watching
 from abbe.service.storage.store import Store
+from tests.faults.sequencer_world import PATIENT
 from tests.scenarios.conftest import ABBE, Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import position_and_counters, refused, registers, runs_of, wait_for
@@ -207,6 +210,13 @@ if os.environ.get("ABBE_TEST_LONG"):
 every run plays three of them."""
 
 
+@pytest.fixture
+def patient(monkeypatch):
+    """A simulated controller that waits for a core is not silent. How long a real one may be: tests/faults/test_interlocks.py."""
+    monkeypatch.setattr("abbe.service.site.Watching", partial(Watching, unknown_s=PATIENT.unknown_s))
+
+
+@pytest.mark.usefixtures("patient")
 @pytest.mark.parametrize(("words", "codes"), RENAMED.values(), ids=RENAMED)
 def test_a_machine_that_was_renamed_takes_the_table_back_first_with_every_command(command, killed, tmp_path, words, codes):
     machine = killed.machine(tmp_path, "mill-A", more=SCHEDULE)
