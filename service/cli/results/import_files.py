@@ -87,9 +87,10 @@ def _import_folder(folder: Path, db: str | None, machine: Path | None, *, as_jso
     conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
 
 
-def _said(campaign: str, runs: int, url: str, *, as_json: bool) -> None:
-    doc = {"campaign": campaign, "runs": runs, "database": url}
-    answer(doc, f"imported campaign {campaign!r} with {runs} runs into {url}", as_json=as_json)
+def _said(campaign: str, runs: int, url: str, *, beside: int = 0, as_json: bool) -> None:
+    doc = {"campaign": campaign, "runs": runs, "beside": beside, "database": url}
+    more = f" and {beside} tests and figures beside them" if beside else ""
+    answer(doc, f"imported campaign {campaign!r} with {runs} runs{more} into {url}", as_json=as_json)
 
 
 def _import_files(
@@ -124,7 +125,8 @@ def _import_files(
         raise typer.Exit(NOT_STORED)
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(store_folder(store, made.folder))
-        _said(record.name, len(made.folder.runs), store.url, as_json=as_json)
+        beside = sum(len(made.folder.campaign.get(key, ())) for key in ("readings", "stated"))
+        _said(record.name, len(made.folder.runs), store.url, beside=beside, as_json=as_json)
     conclude(f"abbe report {quote(record.name)}", machine=machine, db=db, as_json=as_json)
 
 

@@ -148,7 +148,8 @@ def test_a_campaign_of_files_survives_export_and_import(abbe: Abbe) -> None:
 
 def test_results_of_a_ball_bar_are_reported_without_an_uncertainty(abbe: Abbe) -> None:
     Path("xy.b5r").write_text(B5R.format(encoding="utf-8", machine="VMC-1"))
-    assert abbe("import", "xy.b5r", "x.rtl", "--yes", "--name", "both").code == 0
+    done = abbe("import", "xy.b5r", "x.rtl", "--yes", "--name", "both")
+    assert "imported campaign 'both' with 1 runs and 4 tests and figures beside them" in done.out
     found = report(abbe, "both")
     (circularity,) = [one for one in found["figures"] if one["symbol"] == "AF_CIRCULARITY"]
     assert (circularity["value"], circularity["expanded"], circularity["unit"]) == (11.4, None, "µm")
@@ -173,6 +174,7 @@ def test_a_trace_asks_for_its_unit_and_place(abbe: Abbe) -> None:
     assert "the file does not say the unit of the readings - give --unit VALUE" in abbe.fails("import", "d.rtx", "--yes", "--axis", "X")
     assert abbe("import", "d.rtx", "--yes", "--axis", "X", "--unit", "um", "--at", "100").code == 0
     assert abbe("report", "d", "--out", "d.json").code == 0
+    assert "the axis stood still: readings over time tell no geometry" in abbe("discover", "d").err
 
 
 def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:
