@@ -10,10 +10,12 @@ RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 BENCH_VENV := .venv-bench
 BENCH_READY := $(BENCH_VENV)/.ready
+RELEASE_VENV := .venv-release
+RELEASE_READY := $(RELEASE_VENV)/.ready
 COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint fmt docs bench lock clean
+.PHONY: help demo test test-long lint fmt docs bench lock release clean
 # Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
@@ -61,9 +63,13 @@ lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer v
 	$(COMPILE) $(ARGS) pyproject.toml -o requirements.lock
 	$(COMPILE) $(ARGS) --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
 	$(COMPILE) $(ARGS) --extra bench -c requirements-dev.lock pyproject.toml -o requirements-bench.lock
+	$(COMPILE) $(ARGS) --extra release -c requirements.lock pyproject.toml -o requirements-release.lock
+
+release: $(RELEASE_READY) ## source archive, wheel, bill of materials and wheelhouse in dist/, checked and tried without a network; a dry run
+	@deploy/release.sh $(ARGS)
 
 clean: ## remove caches and build products (.venv stays)
-	rm -rf $(BENCH_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(BENCH_VENV) $(RELEASE_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find service drivers models simulators tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -91,4 +97,11 @@ $(BENCH_READY): requirements-bench.lock pyproject.toml | $(BIN)/python
 	@$(BIN)/python -m venv $(BENCH_VENV)
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-bench.lock
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
+	@touch $@
+
+# The tools of a release see the product's packages and add their own.
+$(RELEASE_READY): requirements-release.lock pyproject.toml | $(BIN)/python
+	@echo "setting up $(RELEASE_VENV) from requirements-release.lock, about a minute"
+	@$(BIN)/python -m venv $(RELEASE_VENV)
+	@$(RELEASE_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-release.lock
 	@touch $@
