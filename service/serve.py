@@ -94,6 +94,7 @@ class Service:
         self._shelf = StoreShelf(store, clock, (setup.machine, store.machines.add(setup.machine, setup.doc)), topics, self._posted)
         book = AuditBook(store, setup.store_url)
         alarms = self._make_alarms(book)
+        self._pushes_itself = alarms is not None and alarms.duties.push is not None
         checks = CheckJobs(setup.machine, setup.check(store), self._shelf, clock, alarms.checked if alarms is not None else None)
         recipes = tuple(dict.fromkeys([*setup.recipes, *(split_recipe_name(schedule.recipe)[0] for schedule in setup.schedules)]))
         self._jobs = JobRegistry(
@@ -137,6 +138,7 @@ class Service:
             self._jobs.full.names,
             setup.web.memory_mb,
             setup.control,
+            self._pushes_itself,
         )
 
     def _changed(self) -> None:

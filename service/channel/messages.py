@@ -87,6 +87,7 @@ class Begin:
     campaigns: Annotated[tuple[Word, ...], Field(max_length=200)]
     memory_mb: Annotated[int, Field(ge=1)]
     control: Text
+    pushes_itself: bool
 
 
 @dataclass(frozen=True, slots=True)

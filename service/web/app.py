@@ -63,7 +63,7 @@ class Parts:
     """Sources of the routes that need a core: jobs, live events, metrics.
 
     ``recipes``: can be started; ``plans``: can be rehearsed in dry runs; ``campaigns``: recipes that end with a proposal; ``control``:
-    identity of the machine's control, empty if unknown.
+    identity of the machine's control, empty if unknown; ``pushes_itself``: the service pushes what is approved.
     """
 
     core: CoreLine
@@ -73,6 +73,7 @@ class Parts:
     plans: Rehearsals = field(default_factory=Rehearsals)
     campaigns: tuple[str, ...] = ()
     control: str = ""
+    pushes_itself: bool = False
 
 
 def as_in_host_header(host: str) -> str:
@@ -142,7 +143,7 @@ def create_app(
         add_api(app, api)
     if auth is not None:
         add_login(app, environment(), auth)
-        context = _page_context(source, auth, api)
+        context = _page_context(source, auth, api, pushes_itself=parts is not None and parts.pushes_itself)
         add_pages(app, context)
         add_alarm_pages(app, context)
         add_check_page(app, context)
@@ -163,10 +164,10 @@ def create_app(
     return app
 
 
-def _page_context(source: StatusSource, auth: Authenticator, api: Sources | None) -> PageContext:
+def _page_context(source: StatusSource, auth: Authenticator, api: Sources | None, *, pushes_itself: bool) -> PageContext:
     if api is None:
         return PageContext(environment(), auth, source, Reader(auth.store, "", SystemClock()))
-    return PageContext(environment(), auth, source, api.reader, api.rules)
+    return PageContext(environment(), auth, source, api.reader, api.rules, pushes_itself)
 
 
 def _add_routes(app: FastAPI, source: StatusSource) -> None:

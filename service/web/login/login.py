@@ -10,6 +10,7 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 
+from abbe.service.domain.people import UserRecord
 from abbe.service.queries import people
 from abbe.service.users.lockout import LoginOrigin
 from abbe.service.users.roles import Permission
@@ -49,16 +50,12 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         name, password = fields.get("name", ""), fields.get("password", "")
         visit.target = "unknown user"
         origin = await asyncio.to_thread(_login_origin, auth, request, name)
-        wait_s = auth.lockout.wait_s(name, origin)
-        if wait_s > 0:
+        user, wait_s, tried = await identified(auth, origin, name, password)
+        if not tried:
             return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
-        # Counted before the password check: simultaneous tries must not all find the account unlocked.
-        wait_s = auth.lockout.failed(name, origin)
-        user = await asyncio.to_thread(auth.people.check, name, password)
         visit.target = name if await asyncio.to_thread(auth.people.known, name) else "unknown user"
         if user is None:
             return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
-        auth.lockout.succeeded(name, origin)
         visit.who = f"user:{user.name}"
         secret = await asyncio.to_thread(auth.people.begin, user, visit.secret)
         answer = RedirectResponse("/", 303)
@@ -79,6 +76,31 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         return answer
 
     _add_reading(app, auth)
+
+
+async def identified(auth: Authenticator, origin: LoginOrigin, name: str, password: str) -> tuple[UserRecord | None, float, bool]:
+    """The user whose name and password these are, or None; seconds until the next try; False: not tried, after too many wrong ones."""
+    wait_s = auth.lockout.wait_s(name, origin)
+    if wait_s > 0:
+        return None, wait_s, False
+    # Counted before the password check: simultaneous tries must not all find the account unlocked.
+    wait_s = auth.lockout.failed(name, origin)
+    user = await asyncio.to_thread(auth.people.check, name, password)
+    if user is not None:
+        auth.lockout.succeeded(name, origin)
+    return user, wait_s, True
+
+
+async def signature_refusal(auth: Authenticator, request: Request, password: str) -> Response | None:
+    """Refusal of a signature by password of the person who is logged in; None: it is right. Wrong ones count as wrong logins."""
+    visit: Visit = request.state.visit
+    name = visit.principal.name.partition(":")[2].partition("/")[0]
+    origin = await asyncio.to_thread(_login_origin, auth, request, name)
+    user, wait_s, tried = await identified(auth, origin, name, password)
+    if not tried:
+        return problem(429, f"Too many tries. Wait {ceil(wait_s)} s.", headers={"Retry-After": str(ceil(wait_s))})
+    again = f" Next try in {ceil(wait_s)} s." if wait_s else ""
+    return None if user is not None else problem(403, f"The password is wrong: nothing was signed.{again}")
 
 
 def _add_reading(app: FastAPI, auth: Authenticator) -> None:

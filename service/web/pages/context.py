@@ -30,13 +30,17 @@ Number = Annotated[int | None, Query(ge=1, le=LARGEST)]
 
 @dataclass(frozen=True, slots=True)
 class PageContext:
-    """Sources of the screens. ``rules``: limits and certificates of the machine file, so that a screen judges as the report does."""
+    """Sources of the screens. ``rules``: limits and certificates of the machine file, so that a screen judges as the report does.
+
+    ``pushes_itself``: the service pushes what is approved, and takes no order to push.
+    """
 
     env: Environment
     auth: Authenticator
     source: StatusSource
     reader: Reader
     rules: Rules = field(default_factory=Rules)
+    pushes_itself: bool = False
 
     @property
     def store(self) -> Store:
@@ -48,7 +52,7 @@ class PageContext:
         now = await self.source.status()
         zone = zone_of(now)
         values = (
-            {"now": now.now_utc}
+            {"now": now.now_utc, "pushes_itself": self.pushes_itself}
             | values
             | {"bar": strip_of(now), "machine": now.machine, "zone": zone, "stamp": lambda text: stamp(text, zone)}
         )

@@ -11,6 +11,7 @@ from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import AfterValidator
 
 from abbe.service.compensation.proposal_decisions import approve as work_approve
+from abbe.service.compensation.proposal_decisions import same_person
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
 from abbe.service.queries.alarm_path import path_with
@@ -20,8 +21,10 @@ from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
+from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.login.login import signature_refusal
 from abbe.service.web.pages import times
 from abbe.service.web.pages.context import Number, PageContext, can_be_stored, find_or_none
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
@@ -46,7 +49,7 @@ def themed(rules: str) -> str:
     return f"{first}\n{automatic}\n:root[data-theme=dark] figure{{{found[1]}}}\n"
 
 
-LONGEST_FORM = 1024
+LONGEST_FORM = 4096
 HOURS = (1.0, 8.0, 24.0, 72.0)
 Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
@@ -148,7 +151,10 @@ def _add_proposals(app: FastAPI, context: PageContext) -> None:
             return await context.show("changed.html", 409, number=number, text=error.detail)
         key, texts = secrets.token_hex(8), outcome_texts("table.word")
         way = await context.read(path_with, context.reader, "proposal", number)
-        return await context.show("proposal.html", way=way, screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, texts=texts)
+        mine = screen.found.two_people and same_person(screen.found.by, current().who)
+        return await context.show(
+            "proposal.html", way=way, screen=screen, sign=sign, promise=promise, hours=HOURS, key=key, texts=texts, mine=mine
+        )
 
 
 def _add_approval(app: FastAPI, context: PageContext) -> None:
@@ -156,11 +162,17 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
     @needs(Permission.APPROVE)
     async def approve(request: Request) -> Response:
         visit: Visit = request.state.visit
-        decision = _approval(await form_of(request) or {})
+        form = await form_of(request) or {}
+        decision = _approval(form)
         if decision is None:
             return problem(422, "the form needs the number of a proposal, and hours between 0.01 and 720")
         number, hours = decision
         visit.target = f"proposal {number}"
+        if form.get("clear") != "yes":
+            return problem(422, "the form needs the confirmation that the working space is clear")
+        refused = await signature_refusal(context.auth, request, form.get("password", ""))
+        if refused is not None:
+            return refused
         account = visit.principal.name
         name = account.partition(":")[2].partition("/")[0]
         try:

@@ -139,9 +139,8 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
     reader = Reader(store, begin.machine, clock, begin.control)
     view = StatusReader(reader, begin.version, core, core.next_due, begin.broker)
     auth = Authenticator(store, people, AuditBook(store, begin.store_url), Endpoint(begin.port, begin.behind_tls))
-    parts = Parts(
-        core, store, begin.machine, begin.recipes, Rehearsals(begin.plan, begin.recipes, rules=begin.rules), begin.campaigns, begin.control
-    )
+    plans = Rehearsals(begin.plan, begin.recipes, rules=begin.rules)
+    parts = Parts(core, store, begin.machine, begin.recipes, plans, begin.campaigns, begin.control, begin.pushes_itself)
     plant = Gatherer(view.status, store, begin.control)
     api = Sources(
         reader=reader,

@@ -83,6 +83,7 @@ CORE = [
         ("identification",),
         1024,
         "modbus+tcp://127.0.0.1:502",
+        True,
     ),
     MOMENT,
     m.Jobs("jobs", (JOB, replace(JOB, ended_utc=NOW, verification=7))),

@@ -10,15 +10,17 @@ import pytest
 from abbe.service.clock import SystemClock
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
+from abbe.service.users.lockout import LoginOrigin
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.login.access import route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.page import HERE
-from tests.pages_world import PROPOSER, USERS, Filled, Served, as_user, screens
+from tests.pages_world import PHRASE, PROPOSER, USERS, Filled, Served, as_user, screens
 
 SVG = re.compile(r"<svg.*?</svg>", re.DOTALL)
 HEAVIEST = 150_000
+SIGNED = {"clear": "yes", "password": PHRASE}
 
 
 @pytest.fixture
@@ -69,7 +71,7 @@ def test_nobody_sees_a_screen_without_logging_in(running: Served) -> None:
 @pytest.mark.parametrize("name", USERS)
 def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
     may = Permission.APPROVE in ALLOWED[Role(USERS[name])]
-    form = {"number": str(filled.proposals[2]), "hours": "1"}
+    form = {"number": str(filled.proposals[2]), "hours": "1"} | SIGNED
     before = len(running.store.proposals.approvals(filled.proposals[2]))
     with as_user(running, name) as client:
         answer = client.post("/proposal/approve", data=form)
@@ -99,10 +101,22 @@ def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
 )
 def test_what_cannot_be_approved_says_why(running: Served, form: dict[str, str], status: int) -> None:
     with as_user(running, "anna") as client:
-        answer = client.post("/proposal/approve", data=form)
+        answer = client.post("/proposal/approve", data=SIGNED | form)
     assert answer.status_code == status
     assert answer.json()["detail"]
     assert running.store.proposals.approvals(1) == []
+
+
+def test_an_approval_is_a_signature(running: Served, filled: Filled) -> None:
+    """The person who is logged in signs with the password, and says that the space is clear; neither is taken for granted."""
+    number, before = filled.proposals[2], len(running.store.proposals.approvals(filled.proposals[2]))
+    form = {"number": str(number), "hours": "1"}
+    with as_user(running, "anna") as client:
+        assert client.post("/proposal/approve", data=form | {"password": PHRASE}).status_code == 422
+        answer = client.post("/proposal/approve", data=form | {"clear": "yes", "password": "not hers"})
+        assert (answer.status_code, "nothing was signed" in answer.json()["detail"]) == (403, True)
+        assert len(running.store.proposals.approvals(number)) == before
+    running.auth.lockout.succeeded("anna", LoginOrigin("127.0.0.1", "", local=True))
 
 
 def test_the_proposer_cannot_be_the_second_person(running: Served, filled: Filled) -> None:
@@ -110,7 +124,7 @@ def test_the_proposer_cannot_be_the_second_person(running: Served, filled: Fille
     running.people.set_role(PROPOSER, "approver")
     try:
         with as_user(running, PROPOSER) as client:
-            answer = client.post("/proposal/approve", data={"number": str(filled.proposals[2]), "hours": "1"})
+            answer = client.post("/proposal/approve", data={"number": str(filled.proposals[2]), "hours": "1"} | SIGNED)
     finally:
         running.people.set_role(PROPOSER, "metrologist")
     assert answer.status_code == 409
@@ -165,7 +179,7 @@ def test_a_changed_proposal_is_shown_as_changed(running: Served) -> None:
         answer = client.get(f"/proposal?id={number}")
         assert (answer.status_code, "changed after it was stored" in answer.text) == (409, True)
         assert client.get("/proposals").status_code == 200
-        assert client.post("/proposal/approve", data={"number": str(number), "hours": "1"}).status_code == 503
+        assert client.post("/proposal/approve", data={"number": str(number), "hours": "1"} | SIGNED).status_code == 503
 
 
 def static_bytes(client: httpx.Client) -> int:
