@@ -11,7 +11,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, Unjudged
 from abbe.models.discovery.case import CaseRun
-from abbe.models.discovery.instrument_noise import lone, unscaled
+from abbe.models.discovery.instrument_noise import beside_turns, lone, unscaled
 from abbe.models.discovery.solved_model import SolvedModel, free_columns, left_over
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
@@ -118,7 +118,7 @@ def _white(
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
     left = np.where(run.valid, left_over(run, predicted_mm, fitted_setups), 0.0)
-    keep = run.valid * lone(left, [p.n], [p.kind])
+    keep = run.valid * lone(left, [p.n], [p.kind], beside_turns([p]), problem.case.resolution_mm)
     free = free_columns(run, fitted_setups)
     columns = np.column_stack([gap, problem.base.linear(data, solved.theta)[1] @ root, FREE_MM * free]) * keep[:, None]
     white = unscaled(columns, [p.n], [p.kind], problem.colours) / problem.colours[p.kind].sd_mm

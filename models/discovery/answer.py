@@ -169,6 +169,7 @@ class Discovery:
     unjudged : holdout runs that cannot be judged.
     unseen : blind spots of the runs, if nothing was found.
     fitted : significant errors that the present simulation already includes (the scale of a single axis).
+    doubt : what is probably wrong with the data of the runs of ``location``, as text; then nothing was searched.
     """
 
     verdict: Verdict
@@ -192,3 +193,4 @@ class Discovery:
     unjudged: tuple[Unjudged, ...] = ()
     unseen: tuple[BlindSpot, ...] = ()
     fitted: tuple[Fitted, ...] = ()
+    doubt: str = ""

@@ -15,11 +15,12 @@ from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.finding import finding
+from abbe.models.discovery.finding import doubted, finding
 from abbe.models.discovery.instrument_noise import unscaled
+from abbe.models.discovery.mixed_up import mixed_up
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
 from abbe.models.discovery.solved_model import predictions, solve
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping, extra_variance
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping, extra_variance, rough_place
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
 
@@ -44,7 +45,9 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
     white = unscaled(left[:, None], problem.lengths, problem.kinds, problem.colours)[:, 0] / problem.sd_mm()
     sigma = tuple(problem.colours[k].sd_mm for k in problem.kinds)
     leverage = tuple(problem.by_run(problem.projection.leverage))
-    return extra_variance(problem.paths, tuple(problem.by_run(white * valid)), sigma, leverage=leverage, colours=problem.colours)
+    alone = tuple(problem.by_run(1.0 - problem.lone(white * problem.sd_mm())))
+    rest = tuple(problem.by_run(white * valid))
+    return extra_variance(problem.paths, rest, sigma, leverage=leverage, colours=problem.colours, alone=alone)
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
@@ -56,6 +59,9 @@ def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> Wh
         elif f.name == "stick_slip":
             loud = creeping(problem.paths, f)
             use = use * (1.0 - loud) if loud.mean() < MOST_GATED else use
+        elif f.name == "unnamed_rough":
+            there = np.concatenate(rough_place(problem.paths, f.key))
+            use = use * np.where(there > 0, 1.0 / f.parameters["times"], 1.0)
         elif f.name == "unnamed_burst":
             use = use * (1.0 - _burst(problem, f.parameters["t0_s"], f.parameters["width_s"]))
     problem = replace(problem, also=np.concatenate(waves, axis=1))
@@ -102,6 +108,9 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     tell("fitting the present simulation", 0.0)
     plain = whiten(case, baseline_of(case))
     before = predictions(plain, solve(plain, ()))
+    mixed = mixed_up(plain)
+    if mixed is not None:
+        return doubted(finding(plain, plain, (), (), solve(plain, ()), (), (before, before)), mixed)
     tell("comparing effects", 0.2)
     problem, contest, found, loud = searched(plain, effects, tell)
     found, rivals = fairly(contest, found)
@@ -122,9 +131,9 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
         labels = {f.pick.label for f in found} | {f.label for f in loud}
         named = [f.pick for f in found if not f.pick.unnamed]
         loud = _merged(loud, scattered(problem, named))
-        if not found and not loud:
-            break
         problem = without(settled(problem, [f.pick for f in found]), loud) if i == 0 or labels != _labels(found, loud) else problem
+        if not found and not loud and not any(c.gain for c in problem.colours.values()):
+            break
         contest = Contest.of(problem, effects)
         found = selected(contest, named)
         if _labels(found, loud) == labels:
@@ -168,8 +177,8 @@ def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) 
 def settled(problem: WhitenedProblem, picks: list[Pick]) -> WhitenedProblem:
     """Linearise the problem about the joint fit of simulation and picks, and estimate the noise from the residuals of this fit."""
     if not picks:
-        return with_estimated_noise(problem, ())
+        return with_estimated_noise(problem, (), memory=True)
     raw = [p.raw(problem) for p in picks]
     sd = [p.prior_sd(problem, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
     problem = linearised(problem, np.concatenate(raw, axis=1), np.concatenate(sd))
-    return with_estimated_noise(problem, [(p.raw(problem), s) for p, s in zip(picks, sd, strict=True)])
+    return with_estimated_noise(problem, [(p.raw(problem), s) for p, s in zip(picks, sd, strict=True)], memory=True)

@@ -18,9 +18,10 @@ from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
 from abbe.models.discovery.localization import localize_signal, locate
+from abbe.models.discovery.mixed_up import MixedUp
 from abbe.models.discovery.selection import APART, EXCLUDED, Rival, Selection, u_moment
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
-from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures
+from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures, wandering
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Family
@@ -49,9 +50,10 @@ TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a thermal time constant: of several time constants, a short campaign shows only the short ones."""
 RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
-SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration")
-"""Stick-slip and vibration are residues below this share of the strongest mean effect, on any axis: below 1 % of an effect with corners or
-waves (`ROUGH`), below 0.3 % of a smooth one, which leaves less that looks like scatter (a true stick-slip had 1.0 % of a pitch error)."""
+SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
+"""Stick-slip, vibration and outliers of the bar are residues below this share of the strongest mean effect, on any axis: below 1 % of an
+effect with corners or waves (`ROUGH`), below 0.3 % of a smooth one, which leaves less that looks like scatter (a true stick-slip had 1.0 %
+of a pitch error)."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """Effects at the reversals of one axis differ only in form: with less than `AXIS_SHARE` of its evidence, one is a residue of another."""
@@ -238,12 +240,13 @@ def finding(
         verdict, unnamed, location = "unknown", (lacking(lack),), lack
     elif verdict == "unknown":
         location = replace(unnamed[0].location, table=location.table)
+    gaps = gaps_of(problem, residuals[0], residuals[1], floor)
     return Discovery(
         verdict=verdict,
         effects=judgement.effects if is_named else (),
         location=location,
         next_test=_next_test(problem, judgement.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
-        gaps=gaps_of(problem, residuals[0], residuals[1], floor),
+        gaps=scattered(gaps) if is_named and {e.label for e in judgement.effects} & {f.label for f in loud} else gaps,
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
         predicted_mm=predicted[1],
@@ -259,6 +262,16 @@ def finding(
         agreement=agreement,
         unjudged=unjudged,
         unseen=blind_spots(case) if verdict == "none" else (),
+    )
+
+
+def doubted(found: Discovery, mixed: MixedUp) -> Discovery:
+    """Turn a result without effects into the suspicion that readings are under the wrong label; no effect is blamed before."""
+    whose = " and ".join(mixed.runs)
+    doubt = f"the readings of {whose} are probably {mixed.how}: put right, {mixed.remains:.0%} of the misfit of all runs remains"
+    location = Localization(runs=mixed.runs, table=found.location.table)
+    return replace(
+        found, verdict="unknown", doubt=doubt, location=location, next_test=None, rejected=(), agreement=(), unjudged=(), unseen=()
     )
 
 
@@ -287,7 +300,7 @@ def _judge(
     }
     left = {**residues(names, frozenset(e.label for e in scatter)), **left}
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
-    unnamed = tuple(sorted((*structures(problem.case, found, loud), *waves), key=lambda s: (-s.evidence, s.label)))
+    unnamed = tuple(sorted((*structures(problem.case, found, loud), *waves, *wandering(problem)), key=lambda s: (-s.evidence, s.label)))
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
@@ -419,6 +432,13 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
         if test is not None:
             return test
     return None
+
+
+def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
+    """Count what named scatter leaves in the fitted runs as noise of all roles: no model foretells it, so it closes no gap."""
+    fitted = gaps["identify"]
+    scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)
+    return {role: replace(g, floor_mm=float(np.sqrt(g.floor_mm**2 + scatter))) for role, g in gaps.items()}
 
 
 def gaps_of(problem: WhitenedProblem, before: Mapping[str, F1], after: Mapping[str, F1], floor_of: Mapping[str, Floor]) -> dict[str, Gap]:

@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from math import comb
 
 import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
+from abbe.models.effects.path import Path
 
 SHARE, MEMORY = 0.1, 0.75
 """Share of the variance with memory, and its correlation from reading to reading; typical of ball-bars and interferometers in a workshop
 (long-run variance 1.6 times that of one reading)."""
+SHARES, MEMORIES = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95), (0.5, 0.75, 0.9, 0.96, 0.985)
+"""Colours tried for noise that remembers more than usual, such as 1/f noise."""
+REMEMBERS, MOST, LOUDEST = 60.0, 0.8, 4.0
 CLEARLY = 0.85
 """The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
 FINE, QUIET, SHORTEST = 4, 0.25, 24
 """Order of the differences of neighbours that tell the noise whatever the model misses (a wave of eight readings adds 0.5 %); share of an
 instrument's runs that may be quieter than its noise, because effects reach the other runs; and readings that a run must have."""
+CROWD, TURN_MM, CREEP_MM_S = 0.35, 3.0, 4.5
+"""Share of eleven neighbours from which off readings are a disturbance, no accident; travel after a reversal that a spike
+takes; speed below which an axis may stick and slip."""
 LOW = 1.2
 """Relative error of the noise of one run of n readings over 1/sqrt(n), at the share `QUIET` of noise alone: 0.67 times 1.17 (of a median)
 times 1.5 (differences share readings)."""
@@ -28,11 +35,15 @@ LONE = 7.0
 
 @dataclass(frozen=True)
 class Colour:
-    """Noise of one instrument. ``share``: correlated part of its variance; ``memory``: correlation of this part from reading to reading."""
+    """Noise of one instrument. ``share``: correlated part of its variance; ``memory``: correlation of this part from reading to reading.
+
+    ``gain``: by how much (log likelihood) these two explain its readings better than the usual ones; 0 for the usual ones.
+    """
 
     sd_mm: float
     share: float = SHARE
     memory: float = MEMORY
+    gain: float = 0.0
 
     def filter(self) -> tuple[float, float, float]:
         """Return (m, c, v) of the ARMA(1, 1) process with the autocovariance of this noise: (1 - m B) noise = (1 + c B) innovation.
@@ -64,13 +75,58 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
     return out
 
 
+def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> dict[str, Colour]:
+    """Estimate how much the noise of each instrument remembers, from residuals as for `level`; the usual colour unless clearly another.
+
+    Clearly: by `REMEMBERS` over all runs, and better in `MOST` of them, because what happens once or at one place is no noise.
+    """
+    out: dict[str, Colour] = {}
+    ends = np.cumsum(lengths)
+    for kind, colour in colours.items():
+        runs = [
+            _as_read(residual[end - n : end], colour) for n, k, end in zip(lengths, kinds, ends, strict=True) if k == kind and n >= SHORTEST
+        ]
+        out[kind] = colour
+        if not runs:
+            continue
+        usual = np.array([_likelihood(r, Colour(1.0)) for r in runs])
+        tried = {(s, m): np.array([_likelihood(r, Colour(1.0, s, m)) for r in runs]) for s in SHARES for m in MEMORIES}
+        (share, memory), best = max(tried.items(), key=lambda t: float(t[1].sum()))
+        gain = float((best - usual).sum())
+        if gain > REMEMBERS and np.mean(best > usual) > MOST:
+            out[kind] = Colour(colour.sd_mm, share, memory, gain)
+    return out
+
+
+def _as_read(whitened: F1, colour: Colour) -> F1:
+    """Undo `unscaled` for one run."""
+    m, c, v = colour.filter()
+    first = whitened.copy()
+    first[0] /= np.sqrt(v)
+    return np.asarray(scipy.signal.lfilter([np.sqrt(v), c * np.sqrt(v)], [1.0, -m], first))
+
+
+def _likelihood(read: F1, colour: Colour) -> float:
+    """Log likelihood of the readings of a run with noise of this colour and its best level; large values count as `LOUDEST`."""
+    white = unscaled(read[:, None], [read.size], [""], {"": colour})[:, 0]
+    white = np.minimum(np.abs(white), LOUDEST * max(robust_sd(white), 1e-12))
+    v = colour.filter()[2]
+    return float(-0.5 * read.size * np.log(np.mean(white**2) + 1e-24) - 0.5 * (read.size - 1) * np.log(v))
+
+
 def robust_sd(values: F1) -> float:
     """Robust standard deviation of values about zero: median absolute value over 0.6745; NaN without values."""
     return float(np.median(np.abs(values)) / 0.6745) if values.size else float("nan")
 
 
 def level(
-    residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1, resolution_mm: Mapping[str, float]
+    residual: F1,
+    lengths: Sequence[int],
+    kinds: Sequence[str],
+    use: F1,
+    leverage: F1,
+    resolution_mm: Mapping[str, float],
+    colours: Mapping[str, Colour] | None = None,
 ) -> dict[str, Colour]:
     """Estimate the noise of each instrument from residuals that are whitened but not divided by the noise, mm (`unscaled`).
 
@@ -90,7 +146,7 @@ def level(
                 pairs.append(np.diff(scaled)[keep[1:] & keep[:-1]] / np.sqrt(2.0))
         sd, smooth = robust_sd(np.concatenate(singles)), robust_sd(np.concatenate(pairs))
         sd = smooth if smooth < CLEARLY * sd else sd
-        out[kind] = Colour(max(sd, resolution_mm[kind] / np.sqrt(12.0)))
+        out[kind] = replace((colours or {}).get(kind, Colour(0.0)), sd_mm=max(sd, resolution_mm[kind] / np.sqrt(12.0)))
     return out
 
 
@@ -113,16 +169,41 @@ def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, le
     return {kind: Colour(float(np.quantile(sds, QUIET))) for kind, sds in found.items()}
 
 
-def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str]) -> F1:
-    """Weights, shape (n,): 0 for single laser readings far from their neighbours (`LONE`; a beam cut for a moment), else 1."""
+def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str], turns: F1, resolution_mm: Mapping[str, float]) -> F1:
+    """Weights, shape (n,): 0 for single readings far from their neighbours (`LONE`; a beam cut or a cup bumped for a moment), else 1.
+
+    Ball-bar readings off in a row count (`CROWD`), and those beside a reversal (``turns``, 1 there) unless others are off as often.
+    """
     out = np.ones(residual.size)
     start = 0
     for n, kind in zip(lengths, kinds, strict=True):
-        if kind == "laser" and n > 8:
-            part = residual[start : start + n]
-            off = part - scipy.ndimage.median_filter(part, 5, mode="nearest")
-            far = np.abs(off) > LONE * robust_sd(off)
-            if far.mean() <= 0.1:
-                out[start : start + n][far] = 0.0
+        at = slice(start, start + n)
         start += n
+        if n <= 8:
+            continue
+        off = residual[at] - scipy.ndimage.median_filter(residual[at], 5, mode="nearest")
+        least = max(LONE * robust_sd(off), 3.0 * resolution_mm[kind])
+        far = np.abs(off) > least
+        if kind == "bar":
+            high = np.abs(residual[at]) > max(0.5 * least, 0.5 * LONE * robust_sd(residual[at]))
+            far &= scipy.ndimage.uniform_filter1d(high.astype(np.float64), 11, mode="nearest") < CROWD
+            near = turns[at] > 0
+            if far[near].sum() > 2.0 * near.sum() * (far[~near].sum() + 1.0) / max(int((~near).sum()), 1):
+                far &= ~near
+        if far.mean() <= 0.1:
+            out[at][far] = 0.0
     return out
+
+
+def beside_turns(paths: Sequence[Path]) -> F1:
+    """Return 1 for readings beside a reversal of an axis, else 0, stacked over the runs, shape (n,).
+
+    Beside: after it within `TURN_MM`, the last reading before it, or while an axis creeps on its way there (`CREEP_MM_S`).
+    """
+    out = []
+    for p in paths:
+        speed = np.abs(p.at.v_mm_s)
+        slow = (speed < CREEP_MM_S) & (speed.max(axis=0, initial=0.0) >= CREEP_MM_S)
+        near = (p.at.since_mm.min(axis=1) < TURN_MM) | slow.any(axis=1)
+        out.append(np.asarray(near | np.append(near[1:], False), dtype=np.float64))
+    return np.concatenate(out)

@@ -13,10 +13,16 @@ from abbe.models.discovery.experiment.additions import BAR_MIN, LASER_MIN, RUN_M
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed, location_of
 from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
+from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.path import Path
 
-TITLES = {"unnamed_burst": "short disturbance of the reading", "unnamed_place": "readings of the laser off near one place"}
+TITLES = {
+    "unnamed_burst": "short disturbance of the reading",
+    "unnamed_place": "readings of the laser off near one place",
+    "unnamed_rough": "readings of the ball-bar that scatter more at one place",
+}
 """Titles of the variance structures."""
+INSTRUMENTS = {"bar": "ball-bar", "laser": "laser"}
 REPEATS = 3
 """Number of repeats of a run in one set-up."""
 PERIODS = 10
@@ -42,6 +48,20 @@ def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFi
     ]
     out += [Structure(f.label, TITLES[f.name], f.evidence, f.location) for f in loud if is_unnamed(f.name)]
     return tuple(sorted(out, key=lambda s: (-s.evidence, s.label)))
+
+
+def wandering(problem: WhitenedProblem) -> tuple[Structure, ...]:
+    """Return the instruments whose noise remembers more than usual, as structures without a name: no axis, no place and no period."""
+    out = []
+    for kind, colour in problem.colours.items():
+        if colour.gain > 0.0:
+            tests = tuple(dict.fromkeys(p.test for p in problem.paths if p.kind == kind))
+            over = 1.0 / (1.0 - colour.memory)
+            title = (
+                f"noise of the {INSTRUMENTS[kind]} is not white: {colour.share:.0%} of its variance wanders over some {over:.0f} readings"
+            )
+            out.append(Structure(f"{PREFIX}wander:{kind}", title, colour.gain, Localization(tests, depends_on=("time",), shape=title)))
+    return tuple(out)
 
 
 def lacking(location: Localization) -> Structure:
@@ -122,9 +142,16 @@ _ODD = _Plan(
     "the same positions from the other side: if the direction is the cause, the deviation changes its sign again",
 )
 _BEAT = replace(_AGAIN, why=f"{_AGAIN.why}; reading the instrument at standstill{{standstill}} shows whether it needs motion")
+_STANDSTILL = _Plan(
+    ("longer_session",),
+    ("the instrument", "the machine"),
+    "read the instrument at standstill for as long as {run} took: if it wanders there too, it is the instrument, its mounting or the air",
+    always=True,
+)
 _PLANS = {
     "step": _AGAIN, "slip": _AGAIN, "settling": _AGAIN, "burst": _AGAIN, "place": _AGAIN, "surge": _PERIOD, "wave": _PERIOD,
     "bump": _BUMP, "lobes": _LOBES, "smooth": _SMOOTH, "odd": _ODD,
+    "rough": _LOBES, "wander": _STANDSTILL,
 }  # fmt: skip
 
 

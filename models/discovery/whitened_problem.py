@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import Baseline
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.instrument_noise import Colour, level, lone, unscaled
+from abbe.models.discovery.instrument_noise import Colour, beside_turns, level, lone, remembered, unscaled
 from abbe.models.effects.effect import Signal, Values
 from abbe.models.effects.path import Path
 
@@ -178,6 +178,10 @@ class WhitenedProblem:
         """Standard deviation of every reading's noise, mm, shape (n,)."""
         return np.repeat([self.colours[k].sd_mm for k in self.kinds], self.lengths)
 
+    def lone(self, residual: F1) -> F1:
+        """Weights, shape (n,): 0 for single readings far from their neighbours (`abbe.models.discovery.instrument_noise.lone`), else 1."""
+        return lone(residual, self.lengths, self.kinds, beside_turns(self.paths), self.case.resolution_mm)
+
     def by_run(self, values: F1) -> list[F1]:
         """Split stacked values (n,) into one array per run."""
         return np.split(values, np.cumsum(self.lengths)[:-1])
@@ -291,19 +295,26 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
     return replace(problem, projection=projection, column_cache={}, banks=WeakSet())
 
 
-def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]]) -> WhitenedProblem:
-    """Estimate the noise of a problem again beside the effects ``found`` (raw columns, prior sd), and exclude single laser outliers."""
-    for _ in range(ROUNDS):
+def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]], *, memory: bool = False) -> WhitenedProblem:
+    """Estimate the noise of a problem again beside the effects ``found`` (raw columns, prior sd), and exclude single outliers.
+
+    ``memory``: also estimate how much it remembers (`remembered`); before a search this would take effects for noise.
+    """
+    for k in range(ROUNDS):
         problem = with_projection(problem)
         projection = problem.projection
         for raw, sd in found:
             projection = projection.without(problem.white(raw), sd)
         left = projection.residual * problem.sd_mm()
-        use = problem.use * lone(left, problem.lengths, problem.kinds)
-        colours = level(left, problem.lengths, problem.kinds, use, projection.leverage, problem.case.resolution_mm)
-        if (use != problem.use).any():
-            problem = replace(problem, use=use, tangent=Tangent.of(problem.tangent.raw, use, problem.lengths, problem.kinds, colours))
-        small = all(abs(colours[k].sd_mm / problem.colours[k].sd_mm - 1.0) < STEADY for k in colours)
+        lengths, kinds = problem.lengths, problem.kinds
+        use = problem.use * problem.lone(left)
+        colours = level(left, lengths, kinds, use, projection.leverage, problem.case.resolution_mm, problem.colours)
+        if memory and k == 0:
+            colours = remembered(left, lengths, kinds, colours)
+        other = any(colours[kind].gain != problem.colours[kind].gain for kind in colours)
+        if other or (use != problem.use).any():
+            problem = replace(problem, use=use, tangent=Tangent.of(problem.tangent.raw, use, lengths, kinds, colours))
+        small = not other and all(abs(colours[k].sd_mm / problem.colours[k].sd_mm - 1.0) < STEADY for k in colours)
         problem = replace(problem, colours=colours)
         if small:
             break

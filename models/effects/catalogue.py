@@ -55,4 +55,5 @@ CATALOGUE: tuple[Effect, ...] = (
     air_refraction.EFFECT,
     dead_path.EFFECT,
     beam_outliers.EFFECT,
+    beam_outliers.BAR,
 )

@@ -109,6 +109,43 @@ def _named(others: list[str]) -> str:
     return f"run {others[0]}" if len(others) == 1 else f"{len(others)} other runs ({others[0]}, ...)"
 
 
+OTHER_FEED = 0.3
+"""Relative difference between a ball-bar run's stated feed and the median one of its positions and times from which the column is wrong."""
+AGREE, ALIKE = 0.65, 4
+"""Share of like runs (and how many these must be) in which direction and sense of rotation agree, so that the others' column is wrong."""
+
+
+def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
+    """Flag ball-bar runs whose columns feed_mm_min or direction contradict their positions and times, which the search uses instead."""
+    out = []
+    senses: dict[tuple[str, int], dict[str, float]] = {}
+    for run in runs:
+        if isinstance(run.setup, BarSetup) and len(run.columns) > 1:
+            out += _feed_of_path(run)
+            u = run.columns.q_mm - run.setup.centre_mm
+            around = np.cross(u[:-1], u[1:]).sum(axis=0)
+            axis = int(np.argmax(np.abs(around)))
+            senses.setdefault((run.test, axis), {})[run.run_id] = float(np.sign(around[axis]) * np.median(run.columns.direction))
+    for sense in senses.values():
+        usual = float(np.sign(sum(sense.values())))
+        if len(sense) >= ALIKE and sum(s * usual > 0.0 for s in sense.values()) >= AGREE * len(sense):
+            what = "its column direction contradicts the sense in which its positions turn, which agree in the other runs of this kind"
+            remedy = "correct the column; the search uses the positions"
+            out += [CampaignIssue(name, what, remedy, False) for name, s in sense.items() if s * usual < 0.0]
+    return out
+
+
+def _feed_of_path(run: Run) -> list[CampaignIssue]:
+    took, feed = np.diff(run.columns.t_s), float(np.median(run.columns.feed_mm_min))
+    if not ((took > 0.0).all() and feed > 0.0) or _against_feed(run):
+        return []
+    driven = float(np.median(60.0 * np.linalg.norm(np.diff(run.columns.q_mm, axis=0), axis=1) / took))
+    if driven <= 0.0 or abs(driven / feed - 1.0) <= OTHER_FEED:
+        return []
+    what = f"feed_mm_min says {feed:.0f}, its positions and times say {driven:.0f} mm/min, which is used"
+    return [CampaignIssue(run.run_id, what, "correct the column, or exchange it with that of the right run", False)]
+
+
 COPIED_SHARE = 0.98
 """A run with at least this share of equal readings at equal positions is a copy: noise differs every time."""
 VISIBLE_STEPS = 2.0
@@ -222,7 +259,7 @@ def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
     for run in runs:
         out += _other_machine(machine, run) or geometry_issues(machine, run)
         out += _readings(run)
-    return _nothing_measured(runs) + out + time_issues(runs) + copy_issues(runs)
+    return _nothing_measured(runs) + out + time_issues(runs) + column_issues(runs) + copy_issues(runs)
 
 
 def _nothing_measured(runs: Sequence[Run]) -> list[CampaignIssue]:

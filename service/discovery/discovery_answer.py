@@ -26,6 +26,7 @@ def answer_doc(finding: Finding) -> dict[str, Any]:
         "proved": finding.proved,
         "proof": finding.proof,
     }
+    doc |= {"doubt": finding.doubt} if finding.doubt else {}
     for name in ("beside", "agreement", "fitted", "unseen"):
         if found := getattr(finding, name):
             doc[name] = [asdict(one) for one in found]

@@ -43,7 +43,7 @@ def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
     why = "readings disagree with the present model by more than noise"
     yield DiscoveryStep(state="SUSPICIOUS", why=why, finding=finding)
     if not _names(finding):
-        yield DiscoveryStep(state="UNEXPLAINED", why="nothing in the catalogue explains the gap")
+        yield DiscoveryStep(state="UNEXPLAINED", why=finding.doubt or "nothing in the catalogue explains the gap")
         return
     yield DiscoveryStep(state="PROPOSED", why="has the best evidence, with all rivals refitted")
     judged = judge(finding)

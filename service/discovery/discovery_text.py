@@ -65,6 +65,8 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
     gap = _gap_text(finding)
     if finding.verdict == "none":
         return _nothing_missing_verdict(finding, gap)
+    if finding.doubt:
+        return "bad", "The data look wrong", f"{_capital(finding.doubt)}. {_capital(gap)}. No effect was searched for."
     names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.effects)
     if finding.verdict == "unknown":
         beside = f" Beside it: {names}." if names else _suspect_text(finding)
@@ -197,6 +199,9 @@ def _times(less: float) -> str:
 
 def next_of(finding: Finding) -> list[str]:
     """Tell what to measure next: a test that separates the suspects, else general advice."""
+    if finding.doubt:
+        without = " ".join(f"--without {run}" for run in finding.location.runs)
+        return [f"do next: correct the files, or search without these runs: abbe discover {finding.case} {without}"]
     if finding.next_test is not None:
         return _next_lines(finding.next_test)
     if finding.verdict == "unknown":

@@ -56,6 +56,7 @@ def finding_of(
         unjudged=found.unjudged,
         unseen=found.unseen,
         fitted=found.fitted,
+        doubt=found.doubt,
         thinning=thinning,
         predictions={r.path.label: tuple(found.predicted_mm[r.path.label].tolist()) for r in case.of("sealed")},
         series={r.path.label: _series(found, r) for r in case.runs},

@@ -131,6 +131,7 @@ class DiscoveryFile(FileObject):
     agreement: list[FoundAgreement] = Field(default_factory=list)
     unseen: list[FoundUnseen] = Field(default_factory=list)
     fitted: list[FoundFitted] = Field(default_factory=list)
+    doubt: str = ""
     thinning: FoundThinning | None = None
     rms_before_um: float | None = Field(None, ge=0)
     rms_after_um: float | None = Field(None, ge=0)

@@ -245,6 +245,7 @@ class Finding:
     agreement : how runs that were never fitted agree with their prediction, if nothing is missing.
     unjudged, unseen : runs that cannot be judged, and blind spots, if nothing is missing.
     fitted : parameters of the present simulation that these runs measure.
+    doubt : what is probably wrong with the data of the runs of ``location``; then no effect was searched for.
     thinning : decimation of long runs before the search; None: they were searched as they were read.
     predictions : of sealed runs, mm.
     changed : changes since an earlier solution, if one could be compared.
@@ -270,6 +271,7 @@ class Finding:
     unjudged: tuple[Unjudged, ...] = ()
     unseen: tuple[BlindSpot, ...] = ()
     fitted: tuple[Fitted, ...] = ()
+    doubt: str = ""
     thinning: FoundThinning | None = None
     predictions: Mapping[str, tuple[float, ...]] = field(default_factory=dict)
     series: Mapping[str, RunSeries] = field(default_factory=dict)

@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.instrument_noise import Colour
 from abbe.models.discovery.localization import localize_signal
-from abbe.models.discovery.variance.spectrum import fast, gated_roughness, line_of_axis, loud_windows
+from abbe.models.discovery.variance.spectrum import ALIKE, FEW, fast, gated_roughness, line_of_axis, loud_windows, roughness_of
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
@@ -36,6 +36,13 @@ NAME_PRICE = 7.0
 OFF, PLACE_Z = 3.5, 4.0
 """Standard deviations from which a reading is an outlier; from which the deviation of the readings near outliers proves that the position,
 not a lost beam, is the cause (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
+LEAST_INSIDE, LEAST_RUNS, IN_RUNS, ROUGHER = 12, 3, 0.75, 1.2
+"""For a rough place: readings inside and outside that a run must have, runs, share of them that show it, and least ratio of variances."""
+CLIPPED, MOSTLY = 4.0, 0.7
+"""Standard deviations as which larger deviations count at a rough place; share of wrong readings there from which they belong to it."""
+UNNAMED_PRICE = 3.0
+LEAST_OFF = 10
+"""Minimum number of wrong readings of a ball-bar that get a name; fewer are left out of the fit without a word."""
 LEAST_LASER = 60
 """Minimum number of laser readings for estimating a rate of 1 in 100."""
 DRIVES = ("stick_slip", "vibration")
@@ -145,6 +152,7 @@ def extra_variance(
     *,
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
+    alone: tuple[F1, ...] | None = None,
 ) -> tuple[VarianceFinding, ...]:
     """Find variance effects with positive evidence that no stronger one explains; at most one of vibration and stick-slip per axis.
 
@@ -159,18 +167,24 @@ def extra_variance(
         Share of each reading's noise that the fit absorbed.
     colours : Colour by "bar" and "laser", optional
         Noise with which the residuals were whitened; default: white noise.
+    alone : one array (n,) per run, optional
+        1 for single wrong readings (`abbe.models.discovery.instrument_noise.lone`); those of a ball-bar count as outliers and rough places.
 
     Returns
     -------
     tuple of VarianceFinding
         Evidence above zero only, highest first.
     """
-    found = [f for f in candidates(paths, whitened, sigma_mm, leverage=leverage, colours=colours) if f.evidence > 0]
+    found = [f for f in candidates(paths, whitened, sigma_mm, leverage=leverage, colours=colours, alone=alone) if f.evidence > 0]
     out: list[VarianceFinding] = []
     for finding in sorted(found, key=lambda f: -f.evidence):
         if finding.name in DRIVES and any(_overshadows(o, finding) for o in out):
             continue
+        if finding.name in (*DRIVES, "unnamed_burst") and any(o.name == "unnamed_rough" for o in out):
+            continue
         if finding.name == "unnamed_burst" and any(o.name in DRIVES and 3.0 * o.evidence > finding.evidence for o in found):
+            continue
+        if finding.name == "unnamed_burst" and any(o.name == "bar_outliers" and o.evidence > OVERSHADOWS * finding.evidence for o in out):
             continue
         out.append(finding)
     return tuple(out)
@@ -188,18 +202,22 @@ def candidates(
     *,
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
+    alone: tuple[F1, ...] | None = None,
 ) -> tuple[VarianceFinding, ...]:
     """Return all variance effects with their evidence, which may be negative; parameters as in `extra_variance`."""
     even = _studentised(whitened, leverage)
     bars = [k for k, p in enumerate(paths) if p.kind == "bar"]
     out: list[VarianceFinding] = []
     if bars:
-        subset = tuple(paths[k] for k in bars), tuple(even[k] for k in bars), tuple(sigma_mm[k] for k in bars)
-        quick = tuple(fast(p, r) for p, r in zip(subset[0], subset[1], strict=True))
+        bar_paths, sigma = tuple(paths[k] for k in bars), tuple(sigma_mm[k] for k in bars)
+        off = tuple(np.zeros(paths[k].n) if alone is None else alone[k] for k in bars)
+        kept = tuple(even[k] * (1.0 - o) for k, o in zip(bars, off, strict=True))
+        quick = tuple(fast(p, r) for p, r in zip(bar_paths, kept, strict=True))
         for axis in range(3):
-            out += _vibration(axis, subset[0], quick, subset[2], (colours or {}).get("bar"))
-        out += _stick_slip(*subset)
-        out += _burst(*subset)
+            out += _vibration(axis, bar_paths, quick, sigma, (colours or {}).get("bar"))
+        out += _stick_slip(bar_paths, kept, sigma)
+        out += _burst(bar_paths, kept, sigma)
+        out += _bar_scatter(bar_paths, tuple(even[k] for k in bars), off, sigma)
     lasers = [k for k, p in enumerate(paths) if p.kind == "laser"]
     if sum(paths[k].n for k in lasers) >= LEAST_LASER:
         subset = tuple(paths[k] for k in lasers), tuple(even[k] for k in lasers), tuple(sigma_mm[k] for k in lasers)
@@ -258,6 +276,86 @@ def creeping(paths: tuple[Path, ...], found: VarianceFinding) -> F1:
     return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < fast_mm_s) * float(p.kind == "bar") for p in paths])
 
 
+def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
+    """Return 1 for readings of a quarter of the ball-bar's sphere (``"+X-Y"``: cup to tool towards +X and -Y), else 0, by run."""
+    a, b = AXES.index(key[1]), AXES.index(key[3])
+    signs = [1.0 if s == "+" else -1.0 for s in key[::2]]
+    return tuple(
+        np.asarray((signs[0] * p.look[:, a] > 0) & (signs[1] * p.look[:, b] > 0) & (p.kind == "bar"), dtype=np.float64) for p in paths
+    )
+
+
+def _bar_scatter(paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
+    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); not the latter where most are at the former."""
+    found = _rough_places(paths, tuple(np.clip(r, -CLIPPED, CLIPPED) for r in rest), sigma_mm)
+    if found and found[0].evidence > 0.0:
+        there = np.concatenate(rough_place(paths, found[0].key))
+        wrong = np.concatenate(off)
+        if float(there @ wrong) > MOSTLY * float(wrong.sum()):
+            return found
+    return [*found, *_bar_outliers(paths, tuple(r * o for r, o in zip(rest, off, strict=True)), sigma_mm)]
+
+
+def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
+    """Find the quarter of the sphere in which readings scatter more than in the rest, in nearly every run (`IN_RUNS`) that passes it.
+
+    A deviation of the mean that neighbours share does not count (as in `abbe.models.discovery.variance.spectrum.gated_roughness`).
+    """
+    best: tuple[float, float, str, tuple[F1, ...]] | None = None
+    keys = [f"{s}{AXES[a]}{t}{AXES[b]}" for a, b in ((0, 1), (1, 2), (2, 0)) for s in "+-" for t in "+-"]
+    for key in keys:
+        there = rough_place(paths, key)
+        tried = [(r[r != 0.0], w[r != 0.0] > 0) for r, w in zip(rest, there, strict=True)]
+        runs = [(r, w) for r, w in tried if min(w.sum(), (~w).sum()) >= LEAST_INSIDE]
+        if len(runs) < LEAST_RUNS:
+            continue
+        smooth = [(roughness_of(r), w) for r, w in runs]
+        louder = [float(np.mean(q[w])) > ROUGHER * float(np.mean(q[~w])) for q, w in smooth]
+        gains = (_two_levels(smooth)[0] / ALIKE, _two_levels([(r**2, w) for r, w in runs])[0])
+        if np.mean(louder) >= IN_RUNS and (best is None or min(gains) > best[0]):
+            best = (min(gains), _two_levels(smooth)[1], key, there)
+    if best is None:
+        return []
+    gain, times, key, there = best
+    size = float(np.sqrt(times**2 - 1.0) * np.mean(sigma_mm)) * UM
+    shape = f"readings scatter {times:.2g} times as much where the ball-bar points to {key[:2]} {key[2:]}, in all runs"
+    location = Localization(localize_signal(paths, there).tests, depends_on=("bar azimuth",), shape=shape)
+    evidence = float(gain - np.log(len(keys)) - NAME_PRICE - UNNAMED_PRICE)
+    return [VarianceFinding("unnamed_rough", key, size, 0.3 * size, {"times": times}, evidence, location)]
+
+
+def _two_levels(runs: list[tuple[F1, NDArray[np.bool_]]]) -> tuple[float, float]:
+    """Gain in log likelihood of two levels of noise over one, and their ratio; squared readings, and whether they are inside, by run.
+
+    The largest `FEW` squares of a run do not count.
+    """
+    inside, outside = (np.concatenate([np.sort(q[w == side])[:-FEW] for q, w in runs]) for side in (True, False))
+    a, b = float(np.mean(inside)), float(np.mean(outside))
+    both = float(np.mean(np.concatenate([inside, outside])))
+    gain = -0.5 * (inside.size * np.log(a / both) + outside.size * np.log(b / both)) if a > b else 0.0
+    return gain, float(np.sqrt(a / b))
+
+
+def _bar_outliers(paths: tuple[Path, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
+    """Name single wrong readings of a ball-bar from some of them on (`LEAST_OFF`).
+
+    ``off``: whitened residuals of these readings (`abbe.models.discovery.instrument_noise.lone`), one array (n,) per run, all others zero.
+    Their evidence is that of normal noise against noise as wide as they are.
+    """
+    sizes = np.concatenate([o[o != 0.0] * s for o, s in zip(off, sigma_mm, strict=True)])
+    sigmas = np.concatenate([o[o != 0.0] for o in off])
+    readings = sum(p.n for p in paths if p.kind == "bar")
+    if sizes.size < LEAST_OFF:
+        return []
+    width = float(np.sqrt(np.mean(sigmas**2)))
+    evidence = sizes.size * (0.5 * (width**2 - 1.0) - np.log(width) - np.log(readings / sizes.size)) - NAME_PRICE
+    size = float(np.sqrt(np.mean(sizes**2))) * UM
+    found = localize_signal(paths, off)
+    location = Localization(found.tests, runs=found.runs)
+    u = size / float(np.sqrt(2.0 * sizes.size))
+    return [VarianceFinding("bar_outliers", "", size, u, {"rate": sizes.size / readings}, float(evidence), location)]
+
+
 def _burst(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
     loud = loud_windows(paths, rest)
     if loud is None:
@@ -268,7 +366,11 @@ def _burst(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float,
     )  # fmt: skip
     size = float(np.sqrt(2.0 * max(excess, 0.0))) * sigma_mm[k] * UM
     parameters = {"t0_s": t0, "width_s": width}
-    return [VarianceFinding("unnamed_burst", "", size, 0.3 * size, parameters, float(gain - np.log(tried) - NAME_PRICE - 3.0), location)]
+    return [
+        VarianceFinding(
+            "unnamed_burst", "", size, 0.3 * size, parameters, float(gain - np.log(tried) - NAME_PRICE - UNNAMED_PRICE), location
+        )
+    ]
 
 
 def _outliers(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:

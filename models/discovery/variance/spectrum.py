@@ -193,7 +193,7 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
     values = np.concatenate(rest)
     read = values != 0.0
-    fits = tuple(_RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([_rough(r) for r in rest]), values**2))
+    fits = tuple(_RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([roughness_of(r) for r in rest]), values**2))
     out: dict[int, Roughness] = {}
     for axis in range(3):
         speed = np.concatenate([np.where(np.ptp(p.at.q_mm[:, axis]) > 0, np.abs(p.at.v_mm_s[:, axis]), np.inf) for p in paths])
@@ -215,7 +215,7 @@ def _readings(gate: F1) -> float:
     return float(gate.sum() ** 2 / max(float(gate @ gate), 1e-300))
 
 
-def _rough(rest: F1) -> F1:
+def roughness_of(rest: F1) -> F1:
     """Squared second differences, scaled to 1 for white noise; the two ends repeat their neighbours' values."""
     if rest.size < 3:
         return np.ones(rest.size)

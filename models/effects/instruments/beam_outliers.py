@@ -1,6 +1,8 @@
-"""Beam outliers: a few laser readings are wrong because the beam was broken or bent for a moment."""
+"""Outliers: a few readings are wrong because a beam was broken, or a ball-bar was bumped, for a moment."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 
@@ -35,3 +37,15 @@ EFFECT = Effect(
     blind=("ballbar_helix", "ballbar_circle"),
     separated_by={"backlash": ("longer_session",)},
 )
+BAR = replace(
+    EFFECT,
+    name="bar_outliers",
+    title="outliers of the ball-bar",
+    signal=of_kind("bar", struck, 1),
+    needs="ball-bar runs; a robust fit shows them",
+    signature="isolated readings far from their neighbours, in no order",
+    remedy_text="clean balls and cups, check magnets, cable and radio link of the bar, repeat the run",
+    blind=("laser_diagonal", "laser_linear"),
+    separated_by={},
+)
+"""The same of a ball-bar: dirt in a cup, a bumped table, a broken link."""

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import scipy
 
 from abbe.models.arrays import F1
+from abbe.models.discovery.instrument_noise import Colour, lone, remembered, unscaled
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, contaminated, extra_variance
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import bar, campaign, circle, noise
@@ -70,6 +72,54 @@ def test_a_burst_of_one_run_is_located_and_has_no_name() -> None:
     assert bursts[0].location.runs == (run.label,)
     assert bursts[0].location.time_s is not None
     assert bursts[0].location.time_s[0] - 1 < middle < bursts[0].location.time_s[1] + 1
+
+
+def test_single_wrong_readings_of_a_bar_have_a_name_and_nothing_else_is_blamed() -> None:
+    rng = np.random.default_rng(6)
+    wrong = [(rng.uniform(size=p.n) < 0.05) * float(p.kind == "bar") for p in PATHS]
+    rest = tuple(e + w * 8e-3 * rng.choice([-1, 1], p.n) / s for e, w, p, s in zip(noise(PATHS, 3), wrong, PATHS, SIGMA, strict=True))
+    kept = lone(
+        np.concatenate(rest), [p.n for p in PATHS], [p.kind for p in PATHS], np.zeros(sum(p.n for p in PATHS)), {"bar": 0.0, "laser": 0.0}
+    )
+    assert np.mean((kept == 0.0) == (np.concatenate(wrong) > 0.0)) > 0.995
+    alone = tuple(np.split(1.0 - kept, np.cumsum([p.n for p in PATHS])[:-1]))
+    only, *others = extra_variance(PATHS, rest, SIGMA, alone=alone)
+    assert others == []
+    assert only.label == "bar_outliers"
+    assert only.strength == pytest.approx(8.0, rel=0.1)
+    assert only.parameters["rate"] == pytest.approx(0.05, abs=0.01)
+
+
+def test_readings_off_in_a_row_or_at_every_reversal_are_no_accident() -> None:
+    rest = np.random.default_rng(7).normal(size=400)
+    rest[100:108] += 20.0 * np.array([1, -1, 1, -1, 1, -1, 1, -1])
+    turns = np.zeros(400)
+    turns[[20, 120, 220, 320]] = 1.0
+    rest[turns > 0] += 25.0
+    resolution = {"bar": 0.0}
+    assert lone(rest, [400], ["bar"], turns, resolution).all()
+    rest[[50, 250]] = 30.0
+    assert np.flatnonzero(lone(rest, [400], ["bar"], turns, resolution) == 0.0).tolist() == [50, 250]
+
+
+def test_a_quarter_where_the_bar_scatters_more_is_a_place_without_run_or_time() -> None:
+    rng = np.random.default_rng(9)
+    more = only_bars(lambda p: 1e-3 * rng.standard_normal(p.n) * ((p.look[:, 0] > 0) & (p.look[:, 1] > 0)))
+    first = found(more)[0]
+    assert first.label == "unnamed_rough:+X+Y"
+    assert "to +X +Y, in all runs" in first.location.shape
+    assert (first.location.runs, first.location.time_s) == ((), None)
+
+
+@pytest.mark.parametrize(("runs", "remembers"), [(8, True), (2, False)])
+def test_noise_that_wanders_in_all_runs_is_noise_and_in_few_it_is_not(runs: int, remembers: bool) -> None:
+    rng = np.random.default_rng(10)
+    lengths, kinds, usual = [300] * 8, ["bar"] * 8, {"bar": Colour(1.0)}
+    slow = scipy.signal.lfilter([1.0], [1.0, -0.95], rng.normal(size=(8, 300)) * 0.5, axis=1) * (np.arange(8) < runs)[:, None]
+    white = unscaled((rng.normal(size=2400) + slow.ravel())[:, None], lengths, kinds, usual)[:, 0]
+    colour = remembered(white, lengths, kinds, usual)["bar"]
+    assert (colour.gain > 0.0) == remembers
+    assert (colour.memory > 0.85) == remembers
 
 
 def test_noise_alone_names_nothing() -> None:

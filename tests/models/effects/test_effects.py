@@ -51,7 +51,7 @@ def test_an_effect_is_declared_and_behaves(effect: Effect) -> None:
 
 
 def test_the_names_are_those_of_the_exchange_format() -> None:
-    assert len(BY_NAME) == len(CATALOGUE) == 27
+    assert len(BY_NAME) == len(CATALOGUE) == 28
     known = set(BY_NAME) | {e.label(k) for e, k in LABELS}
     assert {r for e in CATALOGUE for r in e.separated_by} <= known
 

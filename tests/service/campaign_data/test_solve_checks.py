@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.machine import Machine
 from abbe.models.paths import helix_points, step_diagonal
-from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, refuse, time_issues
+from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, column_issues, refuse, time_issues
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, revision, run_digest, versions
 from abbe.service.campaign_data.run_geometry import geometry_mistake
 from abbe.service.errors import CampaignRefused
@@ -180,6 +180,21 @@ def test_times_in_ms_and_runs_at_the_same_time_are_flagged_by_name():
     (flag,) = time_issues(runs_of([*good, fed(helix(), "e", 2010)]))
     assert {flag.run} <= {"b", "e"}
     assert "lies within that of run" in flag.what
+
+
+def test_columns_that_contradict_the_positions_are_flagged_by_name():
+    good = [fed(circle(), label, 1000.0 * k) for k, label in enumerate("abcd")]
+    for run in good:
+        run["columns"]["direction"] = [1] * 200
+    assert column_issues(runs_of(good)) == []
+    for run, key, factor in ((good[1], "direction", -1), (good[2], "feed_mm_min", 4.0)):
+        run["columns"][key] = [factor * v for v in run["columns"][key]]
+    feed, direction = column_issues(runs_of(good))
+    driven = good[0]["columns"]["feed_mm_min"][0]
+    assert feed.line.startswith(f"run c: feed_mm_min says {4 * driven:.0f}, its positions and times say {driven:.0f} mm/min")
+    assert direction.line.startswith("run b: its column direction contradicts the sense in which its positions turn")
+    assert not feed.refuse
+    assert not direction.refuse
 
 
 def test_a_set_up_is_found_by_its_whole_name():
