@@ -9,7 +9,7 @@ from abbe.drivers.api import DeviceInfo, LaserFlag, LaserReading
 from abbe.drivers.described.registers import TO_OURS
 from abbe.drivers.described.source import Snapshot, Source, meanings, physical
 from abbe.drivers.device_file import SIZE, Command, DeviceFile
-from abbe.drivers.errors import DeviceFault, NotProved, Refused, ReplyTimeout
+from abbe.drivers.errors import DeviceFault, NotProved, Rebooted, Refused, ReplyTimeout
 
 FLAGS = {
     "beam lost": LaserFlag.BEAM_LOST,
@@ -22,6 +22,8 @@ INVALID = FLAGS.keys() - {"signal low"}
 LOSES_ZERO = {"beam lost", "no reflector", "fault"}
 """States after which an incremental instrument must be zeroed anew."""
 TENTH_NM_PER_MM = 1e7
+SOON_S = 10.0
+"""A count of 16 bits does not pass half of its range in this time, at up to 1000 readings a second and more."""
 NEW_S = 2.0
 """Longest wait for a new reading; a device that shows an old one longer is stuck."""
 ZEROED_MM = 0.05
@@ -41,6 +43,7 @@ class DescribedMeter:
         self._raw: dict[str, float] = {}
         self._total: dict[str, float] = {}
         self._epoch = -1
+        self._seen_s = float("-inf")
         self._count = 0
         self._not_before: int | None = None
 
@@ -164,17 +167,24 @@ class DescribedMeter:
         """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else ours."""
         if snapshot.epoch != self._epoch:
             self._epoch, self._zero_mm = snapshot.epoch, None
-        steps = [self._step(name, snapshot.counts[name]) for name in ("counter", "time") if name in self.file.values]
+        soon, self._seen_s = snapshot.host_s - self._seen_s < SOON_S, snapshot.host_s
+        steps = [self._step(name, snapshot.counts[name], soon=soon) for name in ("counter", "time") if name in self.file.values]
         self._count += bool(steps[0]) if steps else 1
         return self._count
 
-    def _step(self, name: str, raw: float) -> float:
-        """Add the change of a count that may wrap to its total, and return it."""
+    def _step(self, name: str, raw: float, *, soon: bool) -> float:
+        """Add the change of a count that may wrap to its total, and return it; raise Rebooted if it went back ``soon`` after the last."""
         value, before = self.file.values[name], self._raw.get(name)
         step = raw if before is None else raw - before
+        size = float("inf")
         if self.file.modbus is not None and value.type[0] != "f":
-            step %= 1 << 16 * SIZE[value.type]
+            size = 1 << 16 * SIZE[value.type]
+            step %= size
         self._raw[name] = raw
+        if before is not None and (step < 0 or (soon and step > size / 2)):
+            self._zero_mm = None
+            detail = f"its {name} went back from {before:.10g} to {raw:.10g}: it restarted, or an old reply came late"
+            raise Rebooted(self.name, "read", detail, "zero it, then measure this test again")
         self._total[name] = self._total.get(name, 0.0) + step
         return step
 

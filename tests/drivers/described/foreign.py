@@ -42,7 +42,8 @@ class World:
 
     def run(self, track: Sequence[tuple[float, float]]) -> None:
         """From now on the target follows a track (s, mm), at 40 ms a reading."""
-        begin_ms = struct.unpack_from("<I", self._memory, 4 * FIELDS.index("ms"))[0] or 1000
+        now_ms = struct.unpack_from("<I", self._memory, 4 * FIELDS.index("ms"))[0]
+        begin_ms = now_ms or round(1000 * time.monotonic()) + 100  # its own clock until now
         self.set(n=0)
         for k, (s, mm) in enumerate(track):
             struct.pack_into("<Ii", self._memory, 4 * len(FIELDS) + 8 * k, begin_ms + round(1000 * s), round(PER_MM * mm))
@@ -50,6 +51,34 @@ class World:
 
     def close(self) -> None:
         self._memory.close()
+
+
+def put(file: Path, text: str) -> None:
+    """Put text into a file that others read: they find the old one or the new one."""
+    file.with_name(f"{file.name}.new").write_text(text)
+    file.with_name(f"{file.name}.new").replace(file)
+
+
+class LineWorld:
+    """What the scale of `foreign_scale.pl` will read, in a file."""
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self.move_to(0.0)
+
+    def move_to(self, mm: float) -> None:
+        put(self.path, f"at {mm}\n")
+
+    def run(self, track: Sequence[tuple[float, float]]) -> None:
+        """From now on the target follows a track (s, mm), at 40 ms a reading."""
+        put(self.path, "track\n" + "".join(f"{s:.4f} {mm:.7f}\n" for s, mm in track))
+
+    async def person(self, text: str) -> None:
+        """Somebody beside the scale, who does what he is asked."""
+        if text.startswith("Block"):
+            put(self.path, "lost\n")
+        else:
+            self.move_to(10.0 if "AWAY" in text else 0.0)
 
 
 def compiled(folder: Path) -> Path | None:

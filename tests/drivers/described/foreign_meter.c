@@ -3,7 +3,7 @@
  * Low register first (CDAB). Input registers: 100 u32 0x12345678, 102 u32 serial number, 104 u16 start number, 110 i32 pulses of 10 nm,
  * 112 u32 milliseconds, 114 u16 readings so far, 115 u16 state (bit 2: count lost, bit 3: weak), 116 f32 air in degrees Fahrenheit.
  * Holding register 50: 7 sets the pulses to zero and is acknowledged by 107 in register 51.
- * A file shared with the test says where the target is: int32 pulses, uint32 ms (0: its own clock), uint32 stuck, uint32 state, uint32 ABCD.
+ * A file shared with the test says where the target is: int32 pulses, uint32 ms (0: its own clock), uint32 stuck (2: once back), uint32 state, uint32 ABCD.
  * With a track (its length n, then n times uint32 ms and int32 pulses) every reading is 40 ms later than the one before, and on the track, with
  * a noise of +-300 nm.
  */
@@ -44,7 +44,8 @@ static void show(modbus_mapping_t *map, volatile struct world *w, int32_t zero, 
     struct timespec now;
     clock_gettime(CLOCK_MONOTONIC, &now);
     follow(w);
-    if (!w->stuck) { readings++; ms = w->ms ? w->ms : (uint32_t)(now.tv_sec * 1000 + now.tv_nsec / 1000000); put32(in + 110, (uint32_t)(w->pulses - zero), w->high_first); }
+    if (w->stuck == 2) { readings -= 9; w->stuck = 0; }
+    if (w->stuck != 1) { readings++; ms = w->ms ? w->ms : (uint32_t)(now.tv_sec * 1000 + now.tv_nsec / 1000000); put32(in + 110, (uint32_t)(w->pulses - zero), w->high_first); }
     put32(in + 100, 0x12345678, w->high_first);
     put32(in + 102, 40175, w->high_first);
     in[104] = start;

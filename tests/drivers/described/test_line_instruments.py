@@ -17,7 +17,7 @@ from abbe.drivers.device_file import SHIPPED
 from abbe.drivers.errors import BadFrame, DeviceFault, NotProved, ReplyTimeout
 from abbe.drivers.links.urls import parse_url
 from abbe.drivers.registry import open_controller
-from tests.drivers.described.foreign import HERE, free_port, listens, program, wait_for
+from tests.drivers.described.foreign import HERE, free_port, listens, program, put, wait_for
 from tests.drivers.described.test_device_test import UTC, kept, verdict
 
 pytestmark = pytest.mark.timeout(120)
@@ -63,12 +63,6 @@ def over_pty(what: str, value: Path, folder: Path) -> Iterator[str]:
         yield f"serial://{link}"
 
 
-def holds(file: Path, text: str) -> None:
-    """Put text into a file that others read: they find the old one or the new one."""
-    file.with_name("new").write_text(text)
-    file.with_name("new").replace(file)
-
-
 async def until_it_raises(ask: Callable[[], Awaitable[object]]) -> None:
     for _ in range(100):
         await ask()
@@ -79,7 +73,7 @@ def person(value: Path, rest: str, moved: dict[str, str]) -> Callable[[str], Awa
 
     async def act(text: str) -> None:
         now = next((what for words, what in moved.items() if words in text), rest)
-        holds(value, now)
+        put(value, now)
 
     return act
 
@@ -90,7 +84,7 @@ def options(ask: Callable[[str], Awaitable[None]], faults: bool = True) -> Optio
 
 @pytest.fixture
 def value(tmp_path: Path, tools: None) -> Path:
-    holds(tmp_path / "value", "0.0")
+    put(tmp_path / "value", "0.0")
     return tmp_path / "value"
 
 
@@ -121,8 +115,8 @@ async def test_what_is_wrong_with_a_gauge_is_named(value: Path, away: str, why: 
 
 
 async def test_a_streaming_sensor_on_a_serial_line_passes(value: Path, tmp_path: Path) -> None:
-    holds(tmp_path / "sensor.toml", SENSOR)
-    holds(value, "100.0 0")
+    put(tmp_path / "sensor.toml", SENSOR)
+    put(value, "100.0 0")
     ask = person(value, "100.0 0", {"AWAY": "105.0 0", "Block": "100.0 1"})
     with over_pty("sensor", value, tmp_path) as url:
         report = await device_test(f"{url}?device={tmp_path / 'sensor.toml'}&baud=9600", options(ask), UTC)
@@ -133,7 +127,7 @@ async def test_a_streaming_sensor_on_a_serial_line_passes(value: Path, tmp_path:
 
 
 async def test_a_temperature_logger_is_only_shown(value: Path) -> None:
-    holds(value, "+20.43")
+    put(value, "+20.43")
     with over_tcp("logger", value) as url:
         report = await device_test(f"{url}?device=temperature-logger", Options(faults=False), UTC)
         assert (report.failed, report.abilities) == ((), (Ability.WATCH,))
@@ -141,7 +135,7 @@ async def test_a_temperature_logger_is_only_shown(value: Path) -> None:
         about = described(parse_url(f"{url}?device=temperature-logger"))
         source = await open_source(about.url, about.file)
         assert (await source.snapshot()).counts == {"temperature": 20.43}
-        holds(value, "OPEN")
+        put(value, "OPEN")
         try:
             with pytest.raises(DeviceFault, match="reports 'OPEN'"):
                 await until_it_raises(source.snapshot)
@@ -150,7 +144,7 @@ async def test_a_temperature_logger_is_only_shown(value: Path) -> None:
 
 
 async def test_a_read_out_of_three_axes_is_a_control_that_is_listened_to(value: Path, tmp_path: Path) -> None:
-    holds(value, "1 2 3")
+    put(value, "1 2 3")
     ask = person(value, "1 2 3", {"axis X": "6 2 3", "axis Y": "1 7 3", "axis Z": "1 2 8"})
     with over_tcp("readout", value) as url:
         report = await device_test(f"{url}?device=digital-read-out", options(ask, faults=False), UTC)
@@ -165,7 +159,7 @@ async def test_a_read_out_of_three_axes_is_a_control_that_is_listened_to(value: 
 
 
 async def test_another_instrument_is_told_by_its_lines(value: Path) -> None:
-    holds(value, "1 2 3")
+    put(value, "1 2 3")
     with over_tcp("readout", value) as url, pytest.raises((BadFrame, ReplyTimeout)):
         await open_meter(parse_url(f"{url}?device=dial-gauge"))
 

@@ -9,7 +9,7 @@ import pytest
 
 from abbe.drivers.api import DisplacementMeter, air_is_compensated, beam_is_good
 from abbe.drivers.described.opening import open_meter
-from abbe.drivers.errors import BadDeviceFile, BadUrl, DeviceFault, ReplyTimeout, WrongDevice
+from abbe.drivers.errors import BadDeviceFile, BadUrl, DeviceFault, Rebooted, ReplyTimeout, WrongDevice
 from abbe.drivers.links.urls import parse_url
 from tests.drivers.described.foreign import FILE, World
 
@@ -74,6 +74,25 @@ async def test_a_stuck_counter_is_named(meter: DisplacementMeter, world: World) 
     with pytest.raises(ReplyTimeout, match=r"counter is stuck at \d+ .* repeats an old reading"):
         await meter.read(after_count=latest.sample_count)
     assert latest.sample_count > first.sample_count
+
+
+async def test_a_counter_that_goes_back_is_a_restart_or_an_old_reply(meter: DisplacementMeter, world: World) -> None:
+    await meter.zero()
+    await meter.read()
+    world.set(stuck=2)
+    with pytest.raises(Rebooted, match=r"its counter went back from \d+ to \d+"):
+        await meter.peek()
+    with pytest.raises(DeviceFault, match="not zeroed"):
+        await meter.read()
+
+
+async def test_a_device_that_takes_single_registers_only(url: str, tmp_path: Path, world: World) -> None:
+    other = changed(tmp_path, ("function = 4\n", "function = 4\nwrite_function = 6\n"))
+    meter = await open_meter(parse_url(url.replace(str(FILE), str(other))))
+    world.move_to(7.0)
+    await meter.zero()
+    assert await displacement_mm(meter) == pytest.approx(0.0)
+    await meter.close()
 
 
 @pytest.mark.parametrize("order", ["ABCD", "BADC", "DCBA"])

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from abbe.drivers.conformance.device_test import Options, device_test
 from abbe.drivers.errors import NotProved
 from abbe.models.arrays import F1, F2
 from abbe.service.campaigns.listen import listen_campaign
@@ -15,6 +17,7 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.cli import run as run_command
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.config import load_machine
+from abbe.service.domain.run import Run
 from abbe.service.errors import ConfigError
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.nc.write import nc_program
@@ -22,8 +25,8 @@ from abbe.service.sequences.recipes.recipe_file import read_recipe
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
-from tests.drivers.described.foreign import World
-from tests.drivers.described.test_device_test import kept, report_of
+from tests.drivers.described.foreign import HERE, LineWorld, World, program, wait_for
+from tests.drivers.described.test_device_test import MOVE, UTC, kept, report_of
 from tests.service.sequences.nc_reader import read_gcode
 
 pytestmark = pytest.mark.timeout(180)
@@ -79,9 +82,9 @@ def track(part: list[tuple[str, F1, float]], beam: F1, at: F1) -> list[tuple[flo
     return out
 
 
-async def test_it_measures_and_the_runs_solve(url: str, world: World, tmp_path: Path, capsys) -> None:
-    report = kept(await report_of(url, world), tmp_path)
-    here = site(tmp_path, f"{url}&tested={report}")
+async def solved(url: str, world: World | LineWorld, tmp_path: Path) -> dict[str, Run]:
+    """Measure the diagonals with an instrument whose report is kept, and return the runs by label."""
+    here = site(tmp_path, url)
     title, recipes = read_recipe(tmp_path / "recipe.toml")
     plan = CampaignPlan(title, tuple(recipe.plan(here.machine) for recipe in recipes))
     parts = blocks(nc_program(here.name, here.machine, plan, "linuxcnc", here.nc).text)
@@ -104,17 +107,43 @@ async def test_it_measures_and_the_runs_solve(url: str, world: World, tmp_path: 
             with pytest.raises(NotProved, match="no table is written into it"):
                 await session.controller.write_bank(0, b"")
             await listen_campaign(session, store, here, plan, operator)
-        measured = {record.label: load_run(store, record.id) for record in store.runs.all(title)}
+        return {record.label: load_run(store, record.id) for record in store.runs.all(title)}
+
+
+def check(measured: dict[str, Run], tmp_path: Path, capsys) -> None:
+    """The readings are those of the distortion along the beams, and the solution is the distortion."""
     for label, run in measured.items():
         columns = run.to_document()["columns"]
         q = np.stack([columns[f"{axis}_mm"] for axis in "xyz"], axis=1)
-        assert np.array(columns["deviation_mm"]) == pytest.approx((q - q[0]) @ DISTORTION.T @ beams[label], abs=4e-4)
-        assert columns["temp_air_C"] == pytest.approx([20.5] * len(q), abs=1e-3)
+        beam = np.array(run.to_document()["setup"]["nominal_beam"])
+        assert np.array(columns["deviation_mm"]) == pytest.approx((q - q[0]) @ DISTORTION.T @ beam, abs=4e-4), label
         assert run.table.crc is None
-    code = run_command(["solve", title, "--machine", str(tmp_path / "mill.toml"), "--json"])
+    code = run_command(["solve", "diagonals", "--machine", str(tmp_path / "mill.toml"), "--json"])
     out, err = capsys.readouterr()
     assert code == 0, err
     found = json.loads(out)["parameters"]
     for name, truth in TRUTH.items():
         assert abs(found[name]["value"] - truth) < 4.0 * found[name]["u"], name
         assert found[name]["u"] < 0.1 * abs(truth), name
+
+
+async def test_a_modbus_meter_measures_and_the_runs_solve(url: str, world: World, tmp_path: Path, capsys) -> None:
+    report = kept(await report_of(url, world), tmp_path)
+    measured = await solved(f"{url}&tested={report}", world, tmp_path)
+    for run in measured.values():
+        assert np.array(run.to_document()["columns"]["temp_air_C"]) == pytest.approx(20.5, abs=1e-3)
+    check(measured, tmp_path, capsys)
+
+
+async def test_a_scale_with_lines_of_text_measures_and_the_runs_solve(require, tmp_path: Path, capsys) -> None:
+    for tool in ("socat", "perl"):
+        require(tool, shutil.which(tool) is not None, f"{tool} is not installed")
+    world, line = LineWorld(tmp_path / "scale"), tmp_path / "line"
+    with program("socat", f"PTY,raw,echo=0,link={line}", f"EXEC:perl {HERE / 'foreign_scale.pl'} {world.path}"):
+        wait_for(line.exists, "the pty of socat")
+        url = f"serial://{line}?device={HERE / 'foreign-scale.toml'}"
+        report = await device_test(url, Options(move=MOVE, ask=world.person), UTC)
+        assert (report.failed, report.serial_no) == ((), "0815")
+        measured = await solved(f"{url}&tested={kept(report, tmp_path)}", world, tmp_path)
+    assert all("temp_air_C" not in run.to_document()["columns"] for run in measured.values())
+    check(measured, tmp_path, capsys)
