@@ -4,7 +4,7 @@ case "$1" in
 gauge)      # answers "?" with its plunger, which goes in when the target comes nearer
     while IFS= read -r -d $'\r' question; do
         case "$question" in
-        '?') value=$(<"$2"); if [ "$value" = lifted ]; then printf 'ERR 21\r'; else printf '%+09.4f\r' "$value"; fi ;;
+        '?') read -r value <"$2"; if [ "$value" = lifted ]; then printf 'ERR 21\r'; else printf '%+09.4f\r' "$value"; fi ;;
         'ID?') printf 'SN 7041\r' ;;
         esac
     done ;;
@@ -15,5 +15,5 @@ readout)    # prints three axes when it gets a Ctrl-B
 sensor)     # sends distance and state by itself
     while :; do read -r value state <"$2"; printf '%.4f,%d\r\n' "$value" "$state" || exit; sleep 0.02; done ;;
 logger)
-    while :; do printf 'T1=%s C\r\n' "$(<"$2")" || exit; sleep 0.1; done ;;
+    while :; do read -r value <"$2"; printf 'T1=%s C\r\n' "$value" || exit; sleep 0.1; done ;;
 esac
