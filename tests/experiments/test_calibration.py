@@ -3,6 +3,7 @@
 import json
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -29,7 +30,10 @@ PIVOTS_MM = np.array([[300.0, 260.0, -120.0], [10.0, 320.0, 260.0], [-70.0, 40.0
 
 
 def known_machine(chain: str, rng: np.random.Generator) -> tuple[TrueMachine, dict[str, float]]:
-    """A machine of polynomials with constant lost motion, and its parameters by the names of a solution, mm and rad."""
+    """A machine of polynomials with constant lost motion, and its parameters by the names of a solution, mm and rad.
+
+    The solver's mirror does not turn with the machine, so this one's does not, either.
+    """
     names: dict[str, float] = {}
 
     def curve(axis: int, component: int):
@@ -44,7 +48,7 @@ def known_machine(chain: str, rng: np.random.Generator) -> tuple[TrueMachine, di
     square = 50e-6 * rng.standard_normal(3)
     names.update(zip(("C0Y", "B0Z", "A0Z"), square, strict=True))
     play = tuple(Play(lambda x, b=b: np.full_like(x, b), np.zeros(3)) for b in LOST_UM)
-    return TrueMachine(chain, STROKE_MM, PIVOTS_MM, curves, square, play), names
+    return TrueMachine(chain, STROKE_MM, PIVOTS_MM, curves, square, play, mirror_turns=False), names
 
 
 def as_the_solver_has_it(step: Step) -> RunData:
@@ -138,3 +142,16 @@ def test_a_case_without_an_answer_is_told_with_what_the_program_said(tmp_path: P
     assert isinstance(refused, Refused)
     assert "r01" in refused.said
     assert "refused: walk00" in table([refused])
+
+
+def test_a_mirror_on_the_spindle_turns_with_the_machine() -> None:
+    machine = replace(known_machine("w-X-Y-b-Z-t", np.random.default_rng(4))[0], play=())
+    diagonal = next(s for s in full_plan(STROKE_MM) if s.run == "r15")
+    square = Setups(np.random.default_rng(0))
+    beam = np.array(diagonal.setup["nominal_beam"])
+    square.mirrors[diagonal.setup["setup_id"]] = beam, beam
+    fixed, turning = (reading_mm(replace(machine, mirror_turns=turns), diagonal, square) for turns in (False, True))
+    beside = (diagonal.axes_mm - diagonal.axes_mm[0]) @ (np.eye(3) - np.outer(beam, beam))
+    turn = machine.motions(diagonal.axes_mm)[:, :, 3:].sum(axis=1)
+    np.testing.assert_allclose(turning - fixed, np.einsum("ni,ni->n", np.cross(turn, beam), beside), rtol=0, atol=2e-5)
+    assert np.abs(turning - fixed).max() > 5e-4

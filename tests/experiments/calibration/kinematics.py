@@ -46,7 +46,7 @@ class TrueMachine:
     """A machine with its 18 error motions, three squareness errors, and what no rigid model has (play, drift).
 
     ``curves[j][c]``: component c (EX EY EZ EA EB EC) of the motion of carriage j. ``squareness``: C0Y, B0Z, A0Z, rad. The tool's end is
-    the spindle reference.
+    the spindle reference. ``mirror_turns``: a laser's flat mirror on the spindle turns with the angular errors, as on a real machine.
     """
 
     chain: str
@@ -56,6 +56,7 @@ class TrueMachine:
     squareness: F
     play: tuple[Play, ...] = ()
     drift: Drift | None = None
+    mirror_turns: bool = True
 
     @property
     def sides(self) -> tuple[tuple[int, ...], tuple[int, ...]]:
@@ -93,6 +94,16 @@ class TrueMachine:
         if self.drift is not None and t_s is not None:
             off[:, 2] -= 1e-3 * self.drift.spindle_um * (1.0 - np.exp(-t_s / self.drift.spindle_s))
         return off
+
+    def mirror(self, axes_mm: F, normal: F) -> F:
+        """Normal of a mirror on the spindle, as the angular errors turn it against the workpiece, shape (n, 3)."""
+        motions, (work, tool) = self.motions(axes_mm), self.sides
+        out = np.tile(normal, (len(axes_mm), 1))[..., None]
+        if not self.mirror_turns:
+            return out[..., 0]
+        for j in (*reversed(tool), *reversed(work)):
+            out = _turn(motions[:, j, 3:])[:, :3, :3] @ out
+        return out[..., 0]
 
 
 def tool_in_workpiece(sides: tuple[tuple[int, ...], tuple[int, ...]], pivots_mm: F, axes_mm: F, motions: F) -> F:

@@ -80,7 +80,8 @@ def reading_mm(machine: TrueMachine, step: Step, setups: Setups) -> F:
     beam = np.array(step.setup["nominal_beam"])
     normal, real = setups.mirror(name, beam)
     moved, off = step.axes_mm - step.axes_mm[0], off - off[0]
-    out = ((moved + off) @ normal) / (normal @ real) - moved @ beam
+    turned = machine.mirror(step.axes_mm, normal)
+    out = np.einsum("ni,ni->n", moved + off, turned) / (turned @ real) - moved @ beam
     return out
 
 
