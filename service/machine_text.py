@@ -29,12 +29,7 @@ tool_mm = {tool_mm}
 # Last days of your instruments' certificates. Without them Abbe measures and solves, but writes no table.
 [calibration]
 {calibration}
-{limits}
-# Above one of these the machine does not pass.
-[verify]
-body_diagonal_um = 20.0
-helix_rms_um = 5.0
-
+{limits}{verify}
 # A SQLite file beside this file.
 [store]
 url = "sqlite:///abbe.sqlite3"
@@ -51,6 +46,12 @@ PIVOTS = """
 [pivots_mm]
 {rows}
 """
+VERIFY = """
+# Above one of these the machine does not pass.
+[verify]
+body_diagonal_um = 20.0
+helix_rms_um = 5.0
+"""
 LIMITS = """
 [limits]
 table_value_um = {value:g}
@@ -60,7 +61,12 @@ table_walk_um = {walk:g}
 
 
 def machine_text(
-    doc: Mapping[str, Any], urls: DeviceUrls, certificates: Mapping[str, date] | None = None, limits: PushLimits | None = None
+    doc: Mapping[str, Any],
+    urls: DeviceUrls,
+    certificates: Mapping[str, date] | None = None,
+    limits: PushLimits | None = None,
+    *,
+    verify: bool = True,
 ) -> str:
     """Return the text of a machine file.
 
@@ -74,6 +80,8 @@ def machine_text(
         Last day of the certificate of ``ballbar`` and ``laser``; one without is a comment.
     limits : PushLimits, optional
         Limits of a table, where they are not the defaults.
+    verify : bool
+        With limits of a check, which decide whether the machine passes.
     """
     known = certificates or {}
     return TEXT.format(
@@ -86,6 +94,7 @@ def machine_text(
         devices="\n".join(_device(role, getattr(urls, role)) for role in ("cnc", "ballbar", "laser", "fixture")),
         calibration="\n".join(f"{role} = {known[role]}" if role in known else f"# {role} = 2027-05-31" for role in ("ballbar", "laser")),
         limits="" if limits is None else _limits(limits),
+        verify=VERIFY if verify else "",
     )
 
 

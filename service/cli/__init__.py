@@ -70,6 +70,8 @@ def run(arguments: Sequence[str] | None = None) -> int:
         if "\n" in text:  # no arguments at all: the message is the help
             sys.stderr.write(text.rstrip() + "\n")
             return BAD_INPUT
+        if "unexpected extra argument" in text and ".toml" in text:  # the machine file once stood there
+            return complain("USE-001", f"{text} - name the machine file by -m FILE")
         return complain("USE-001", f"{text} - `abbe --help` lists commands, `abbe COMMAND --help` their options")
 
 

@@ -69,13 +69,13 @@ def demo_site(ready: dict[str, Any]) -> Site:
 def write_machine_file(site: Site, folder: Path) -> Path:
     """Write a machine file for the running simulated machine, so that other commands can use it."""
     path = folder / "machine.toml"
-    path.write_text(machine_file_of(site), encoding="utf-8")
+    path.write_text(machine_file_of(site, verify=False), encoding="utf-8")
     return path
 
 
-def machine_file_of(site: Site) -> str:
-    """Return the text of the machine file of a simulated machine."""
-    return machine_text(site.doc, site.urls, site.calibrated_until, site.limits)
+def machine_file_of(site: Site, *, verify: bool = True) -> str:
+    """Return the text of the machine file of a simulated machine; ``verify``: with limits of a check."""
+    return machine_text(site.doc, site.urls, site.calibrated_until, site.limits, verify=verify)
 
 
 async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> DemoResult:

@@ -166,7 +166,7 @@ async def served(
     log = machine_file.with_name("service.log")
     with log.open("wb") as out_log:
         process = await asyncio.create_subprocess_exec(
-            *python_command("abbe.service.cli", "serve", machine_file),
+            *python_command("abbe.service.cli", "serve", "-m", machine_file),
             stdin=asyncio.subprocess.DEVNULL,
             stdout=out_log,
             stderr=out_log,

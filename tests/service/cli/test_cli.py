@@ -109,6 +109,7 @@ def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
     [
         (["chek-config"], "error USE-001: No such command 'chek-config'. Did you mean 'check-config'?"),
         (["check-config"], "error CFG-001: no machine is named - give -m FILE"),
+        (["trend", "machine.toml"], "(machine.toml) - name the machine file by -m FILE"),
         (["runs", "--dp", "x"], "error USE-001: No such option: --dp"),
         (["runs"], "error STO-001: there is no database abbe.sqlite3 - give -m FILE or --db URL"),
         (["runs", "--db", "nonsense"], "error STO-001: database URL 'nonsense' cannot be understood"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import re
 import shlex
 from dataclasses import replace
 from pathlib import Path
@@ -22,6 +23,7 @@ from abbe.service.cli.app import app
 from abbe.service.domain.document import document
 from abbe.service.effects.model_book import NewVersion, current
 from abbe.service.storage.store import Store
+from tests.conftest import ROOT as REPOSITORY
 from tests.pages_world import filled_once
 from tests.service.cli.every_command import CASES, Case
 from tests.service.conftest import ERRORS, write_json
@@ -99,6 +101,18 @@ def parsed(words: list[str]) -> str:
         command, words = command.commands[words[0]], words[1:]
     command.make_context(" ".join(name), list(words))
     return " ".join(name)
+
+
+def test_what_starts_abbe_says_it_as_a_person_would() -> None:
+    """The image, the unit and the demonstration: words that no other test hands to the command line."""
+    image = re.search(r"^CMD (\[.*\])$", (REPOSITORY / "deploy" / "Dockerfile").read_text(), re.MULTILINE)
+    unit = re.search(r"^ExecStart=\S*/abbe (.*)$", (REPOSITORY / "deploy" / "abbe.service").read_text(), re.MULTILINE)
+    demo = re.search(r'"abbe\.service\.cli", (.*)\),$', (REPOSITORY / "service" / "demo" / "demo_serve.py").read_text(), re.MULTILINE)
+    assert image is not None
+    assert unit is not None
+    assert demo is not None
+    for words in (json.loads(image[1]), shlex.split(unit[1]), [word.strip().strip('"') for word in demo[1].split(",")]):
+        assert parsed(words) == "serve"
 
 
 @pytest.mark.parametrize("name", HERE)
