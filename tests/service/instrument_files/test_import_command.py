@@ -221,7 +221,7 @@ def test_a_person_is_asked_at_the_terminal(tmp_path: Path) -> None:
     master, slave = pty.openpty()
     os.write(master, "".join(f"{one}\n" for one in answers).encode())
     command = [str(Path(sys.executable).with_name("abbe")), "import", "t.csv"]
-    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(command, stdin=slave, capture_output=True, text=True, check=False)
     os.close(master)
     os.close(slave)
     assert done.returncode == 0, done.stderr
