@@ -40,6 +40,15 @@ def test_a_check_that_could_not_be_completed_says_why_and_what_to_do(running: Se
         assert 'href="/check?id=24"' in client.get("/").text
 
 
+def test_runs_searches_and_pushes_have_their_report_too(running: Served) -> None:
+    with as_user(running, "olga") as client:
+        for path, report in (("/run?id=8", "run/8"), (f"/discovery?id={running.filled.discovery}", "discovery/")):
+            address = re.search(rf'href="(/api/v1/reports/{report}[0-9]*)"', client.get(path).text)
+            assert address is not None, path
+            assert client.get(address[1]).status_code == 200, address[1]
+        assert 'href="/api/v1/reports/push/2"' in client.get("/table").text
+
+
 def test_every_mention_of_a_check_leads_to_it(running: Served) -> None:
     with as_user(running, "olga") as client:
         for path in ("/", "/alarm?id=2"):
