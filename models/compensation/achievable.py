@@ -35,7 +35,7 @@ from abbe.models.compensation.distances import (
 from abbe.models.compensation.grid import Mask, grid_table, quantise_grid
 from abbe.models.compensation.tables import NineTables, entry_u, grid_positions, nine_tables, quantise, table_design
 from abbe.models.functions.motions import PLACES, SQUARENESS
-from abbe.models.geometry.bases import term_values
+from abbe.models.geometry.bases import SMOOTH_ORDER, term_values
 from abbe.models.geometry.chain import design, deviation_mm, squareness_motions
 from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import Machine
@@ -181,9 +181,9 @@ def individually_observable(solution: JointSolution, *, weak: bool = False) -> f
 
 def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
     """Return a minimal set of motions that reproduces the deviation with the machine's own tool; angles are dropped first."""
-    field = _field(solution)
+    smooth, field = _field(solution)
     triangle = scipy.linalg.qr(field / np.maximum(np.linalg.norm(field, axis=0), 1e-300), mode="r")[0][: field.shape[1]]
-    names = [*[t.motion for t in solution.terms], *["rigid"] * 6]
+    names = [*[solution.terms[i].motion for i in smooth], *["rigid"] * 6]
 
     def rank(motions: set[str]) -> int:
         at = [i for i, n in enumerate(names) if n == "rigid" or n in motions]
@@ -198,23 +198,32 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
     return frozenset(kept)
 
 
-def _field(solution: JointSolution) -> F2:
-    """Return the deviation over the volume per unit of every coefficient and of the six rigid motions, shape (3 x points, terms + 6)."""
-    grid = volume_grid(solution.machine.stroke_mm, max(NODES, max(t.order for t in solution.terms) + 2))
-    full = design(solution.machine, solution.terms, grid).reshape(3 * len(grid), -1)
-    return np.concatenate([full, rigid_design(grid).reshape(-1, 6)], axis=1)
+def _field(solution: JointSolution) -> tuple[list[int], F2]:
+    """Return the deviation over the volume per unit of every smooth coefficient and of the six rigid motions, shape (3 x points, q + 6).
+
+    Also which coefficients these are. The rough parts are left out: no angle can replace them.
+    """
+    smooth = [i for i, t in enumerate(solution.terms) if t.order <= SMOOTH_ORDER]
+    terms = tuple(solution.terms[i] for i in smooth)
+    grid = volume_grid(solution.machine.stroke_mm, max(NODES, max(t.order for t in terms) + 2))
+    full = design(solution.machine, terms, grid).reshape(3 * len(grid), -1)
+    return smooth, np.concatenate([full, rigid_design(grid).reshape(-1, 6)], axis=1)
 
 
 def _refit(solution: JointSolution, keep: list[int]) -> F2:
     """Return the coefficients of the kept terms that best reproduce the deviation of one unit of each coefficient, shape (kept, terms)."""
-    n = len(solution.terms)
-    field = _field(solution)
+    smooth, field = _field(solution)
+    n = len(smooth)
+    kept = [k for k, i in enumerate(keep) if i in set(smooth)]
+    own = [smooth.index(keep[k]) for k in kept]
     weight = TOWARDS_ESTIMATE * np.sqrt(len(field))
-    near = np.zeros((len(keep), n))
-    near[np.arange(len(keep)), keep] = weight * np.linalg.norm(field[:, keep], axis=0) / np.sqrt(len(field))
-    a = np.concatenate([field[:, keep], field[:, n:]], axis=1)
-    ridge = np.concatenate([near[:, keep], np.zeros((len(keep), 6))], axis=1)
-    return np.asarray(np.linalg.lstsq(np.concatenate([a, ridge]), np.concatenate([field[:, :n], near]), rcond=None)[0][: len(keep)])
+    near = np.zeros((len(own), n))
+    near[np.arange(len(own)), own] = weight * np.linalg.norm(field[:, own], axis=0) / np.sqrt(len(field))
+    a = np.concatenate([field[:, own], field[:, n:]], axis=1)
+    ridge = np.concatenate([near[:, own], np.zeros((len(own), 6))], axis=1)
+    out = np.eye(len(solution.terms))[keep]
+    out[np.ix_(kept, smooth)] = np.linalg.lstsq(np.concatenate([a, ridge]), np.concatenate([field[:, :n], near]), rcond=None)[0][: len(own)]
+    return out
 
 
 # Tables for controls that take fewer than nine: positioning tables, cross tables beside them, squareness as parameters.

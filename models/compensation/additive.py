@@ -43,9 +43,18 @@ def additive_design(
 
     ``terms``: default the solution's own; may hold higher orders too (`abbe.models.uncertainty.sources`).
     """
-    order = max(t.order for t in solution.terms) + 1  # along a diagonal, an angle times a travel is one order higher than the angle
+    order = diagonal_order(solution.terms)
     field = _design_of(solution.machine, terms or solution.terms)
     return additive(field, solution.machine.stroke_mm, grids_mm, nodes=nodes, order=order)
+
+
+def diagonal_order(terms: tuple[Term, ...]) -> int:
+    """Return the highest Legendre order of what the main effects leave of a deviation along the diagonals.
+
+    Only angles leave something, because the deviation by a translational motion is a function of one axis. Along a diagonal, an angle
+    times a travel is one order higher than the angle.
+    """
+    return max((t.order for t in terms if t.component > 2), default=0) + 1
 
 
 def additive(field: Field, stroke_mm: F2, grids_mm: tuple[F1, F1, F1], *, nodes: int, order: int) -> tuple[F3, F3, F3]:

@@ -39,6 +39,18 @@ class Term:
         return f"{self.motion}.{self.order}" if self.order else self.motion
 
 
+SMOOTH_ORDER = 12
+"""Highest Legendre order of a smooth error motion; higher ones describe what is rough (`rough_terms`)."""
+ROUGH_ORDER = 36
+"""Highest Legendre order of a translational error motion with its rough part: details of a twentieth of the stroke."""
+
+
+@lru_cache(maxsize=1)
+def rough_terms() -> tuple[Term, ...]:
+    """Return the terms of the rough parts of the nine translational error motions: orders above `SMOOTH_ORDER`."""
+    return tuple(t for t in smooth_terms(ROUGH_ORDER) if t.order > SMOOTH_ORDER and t.component < 3)
+
+
 @lru_cache(maxsize=64)
 def smooth_terms(order: int) -> tuple[Term, ...]:
     """Return all 18 order - 3 terms of the 21 error motions up to a Legendre order."""

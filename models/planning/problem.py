@@ -1,8 +1,8 @@
 """Information of one mounting, as a matrix over the unknowns that all mountings share.
 
 Shared are the smooth terms, the lost motion, the bars' lengths and temperature and the laser's wavelength. Cup, mirror tilts, zero and
-drift belong to one mounting and are marginalised (Schur complement with their priors). Every shared unknown counts in units of its prior
-standard deviation, so the prior's information is the unit matrix.
+drift belong to one mounting and are marginalised (Schur complement with their priors). The shared unknowns count as independent ones of
+prior variance 1 (`PlanningProblem.root`), so the prior's information is the unit matrix.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from abbe.models.machine import AXES, Machine
 from abbe.models.planning.measurements import BAR_VALUES, HelixTest, Instruments, Measurement, expected_run
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import bar_length_name, run_design, setup_unknowns
-from abbe.models.solvers.priors import Priors, term_prior_sd
+from abbe.models.solvers.priors import Priors, size_model
 
 LASER_SCALE = "laser_scale"
 BAR_SCALE = "bar_temperature"
@@ -32,14 +32,18 @@ SEARCH_VALUES = 120
 
 @dataclass(frozen=True)
 class PlanningProblem:
-    """Machine, instruments and priors of a plan, and the unknowns that all mountings share (names and prior sd)."""
+    """Machine, instruments and priors of a plan, and the unknowns that all mountings share.
+
+    ``root``, shape (size, size): these unknowns, mm or rad, are ``root`` @ independent ones of prior variance 1, by the prior that a
+    solution starts from (`abbe.models.solvers.priors.size_model`).
+    """
 
     machine: Machine
     tools: Instruments
     priors: Priors
     terms: tuple[Term, ...]
     names: tuple[str, ...]
-    prior_sd: F1
+    root: F2
 
     @property
     def size(self) -> int:
@@ -54,11 +58,12 @@ def problem(machine: Machine, tools: Instruments, order: int, priors: Priors | N
     names = (*(t.name for t in terms), *(f"backlash_{a}" for a in DIRECTIONS), *bars, LASER_SCALE, BAR_SCALE)
     rest = [priors.backlash_mm] * 3 + [tools.u_bar_length_mm] * len(bars) + [tools.u_wavelength]
     rest.append(tools.inputs.u_bar_temperature_k * tools.inputs.bar_expansion_per_k)
-    return PlanningProblem(machine, tools, priors, terms, names, np.concatenate([term_prior_sd(machine, terms, priors), rest]))
+    sizes = size_model(machine, terms, names[len(terms) :], np.array(rest), priors)
+    return PlanningProblem(machine, tools, priors, terms, names, sizes.typical[:, None] * sizes.root)
 
 
 def mounting_information(what: PlanningProblem, tests: tuple[Measurement, ...]) -> F2:
-    """Information of all tests of one mounting about the shared unknowns in units of their prior sd, shape (size, size)."""
+    """Information of all tests of one mounting about the shared unknowns in the units of ``root``, shape (size, size)."""
     runs = _search_runs(what, tests)
     setup = setup_unknowns(runs, what.priors)
     own = [i for i, n in enumerate(setup.names) if n not in what.names]
@@ -101,7 +106,7 @@ def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: 
             out[:, what.names.index(name)] = full[:, first + i]
     if run.radius_mm is not None:  # a bar that is warmer than assumed is longer in proportion to its length
         out[:, what.names.index(BAR_SCALE)] = full[:, first + setup_names.index(bar_length_name(run.radius_mm))] * run.radius_mm
-    return np.asarray(out * what.prior_sd)
+    return np.asarray(out @ what.root)
 
 
 def factor(information: F2) -> F2:
@@ -112,14 +117,14 @@ def factor(information: F2) -> F2:
 
 
 def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:
-    """Deviation, rigid motion removed, at nodes of the inner volume per prior sd of each shared unknown, shape (nodes^3 * 3, size), mm."""
+    """Deviation, rigid motion removed, at nodes of the inner volume per unit of ``root``, shape (nodes^3 * 3, size), mm."""
     box = what.machine.centre_mm[:, None] + share * (what.machine.stroke_mm - what.machine.centre_mm[:, None])
     grid = volume_grid(box, nodes)
     g = design(what.machine, what.terms, grid).reshape(-1, len(what.terms))
     rigid, _ = np.linalg.qr(rigid_design(grid).reshape(-1, 6))
     out = np.zeros((g.shape[0], what.size))
     out[:, : len(what.terms)] = g - rigid @ (rigid.T @ g)
-    return np.asarray(out * what.prior_sd)
+    return np.asarray(out @ what.root)
 
 
 def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
@@ -132,7 +137,7 @@ def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
     out = np.zeros(rows.shape[0])
     for a, axis in enumerate(AXES):
         i = what.names.index(f"E{axis}{axis}.1")
-        out += (rows[:, i] / what.prior_sd[i] * slope * what.machine.length_mm[a] / 2.0) ** 2
+        out += (rows[:, i] / what.root[i, i] * slope * what.machine.length_mm[a] / 2.0) ** 2
     return np.asarray(out.reshape(-1, 3).sum(axis=1))
 
 

@@ -18,7 +18,7 @@ import scipy
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.geometry.bases import Term
+from abbe.models.geometry.bases import SMOOTH_ORDER, Term
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
@@ -30,8 +30,10 @@ NOISE_SD = 2.0
 LEAST_ETA = -8.0
 """Least log ratio of noise variance to expected one, a factor of 55 in the standard deviation and below any instrument's resolution.
 Readings without noise would drive it to minus infinity, and the normal equations beyond double precision."""
+IGNORANCE = 1.5
+"""Ignorance alone makes the size of a motion at most this many times as large as documented (`cautious`)."""
 ROUGHER = 0.2
-"""A motion is taken rougher than most probable by this many posterior standard deviations of its roughness (`cautious`)."""
+"""A motion is taken less smooth than most probable by this many posterior standard deviations of its smoothness (`cautious`)."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -239,26 +241,41 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
         p = posterior(sums, c, model)
         return p.log_evidence - 0.5 * float(weight @ np.concatenate([c.psi, c.eta]) ** 2), p
 
-    c = start
+    c = _moved(start, np.zeros(weight.size), model)
     value, p = objective(c)
     info = np.diag(weight)
     for _ in range(STEPS):
         gradient, info = slope(sums, c, model, p)
+        gradient -= weight * np.concatenate([c.psi, c.eta])
         info = _positive(info + np.diag(weight), float(weight.min()))
-        step = scipy.linalg.solve(info, gradient - weight * np.concatenate([c.psi, c.eta]), assume_a="pos")
+        step = _inward(gradient, info, c, model)
         step *= min(1.0, LARGEST_STEP / max(float(np.abs(step).max()), 1e-300))
-        trial = _moved(c, step)
+        trial = _moved(c, step, model)
         better, found = objective(trial)
         for _ in range(HALVINGS):  # expected information may overshoot
             if better >= value - 1e-9:
                 break
             step *= 0.5
-            trial = _moved(c, step)
+            trial = _moved(c, step, model)
             better, found = objective(trial)
         gain, c, value, p = better - value, trial, better, found
         if gain < TOLERANCE:
             break
     return FittedComponents(c, np.asarray(scipy.linalg.inv(info)), value)
+
+
+def _inward(gradient: F1, info: F2, c: Components, model: SizeModel) -> F1:
+    """Scoring step of the numbers that may move; one at a bound that its gradient pushes against stays there."""
+    now, (low, high) = np.concatenate([c.psi, c.eta]), _bounds(c, model)
+    free = np.flatnonzero(~(((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0))))
+    step = np.zeros(now.size)
+    step[free] = scipy.linalg.solve(info[np.ix_(free, free)], gradient[free], assume_a="pos")
+    return step
+
+
+def _bounds(c: Components, model: SizeModel) -> tuple[F1, F1]:
+    least, none = np.full(c.eta.size, LEAST_ETA), np.full(c.eta.size, np.inf)
+    return np.concatenate([model.low, least]), np.concatenate([model.high, none])
 
 
 def _positive(info: F2, least: float) -> F2:
@@ -267,9 +284,10 @@ def _positive(info: F2, least: float) -> F2:
     return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
 
-def _moved(c: Components, step: F1) -> Components:
-    """The components after a step, with the noise kept above `LEAST_ETA`."""
-    return Components(c.psi + step[: c.psi.size], np.maximum(c.eta + step[c.psi.size :], LEAST_ETA))
+def _moved(c: Components, step: F1, model: SizeModel) -> Components:
+    """The components after a step, kept inside their bounds."""
+    new = np.clip(np.concatenate([c.psi, c.eta]) + step, *_bounds(c, model))
+    return Components(new[: c.psi.size], new[c.psi.size :])
 
 
 def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
@@ -278,7 +296,7 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
     ``sums`` are those of the unknowns in units of their typical size.
     """
     at = LENGTHS.index(model.length)
-    found = {at: estimate(sums.turned(model.root, model.blocks), model, start)}
+    found = {at: estimate(sums.turned(model.root, model.turned), model, start)}
     models = {at: model}
     if not model.blocks:
         return model, found[at]
@@ -287,7 +305,7 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
             new = at + way
             if new not in found:
                 models[new] = with_length(model, LENGTHS[new])
-                found[new] = estimate(sums.turned(models[new].root, model.blocks), models[new], found[at].components)
+                found[new] = estimate(sums.turned(models[new].root, model.turned), models[new], found[at].components)
             if found[new].value <= found[at].value:
                 break
             at = new
@@ -299,21 +317,23 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
 
     It differs in three ways, none of which matters with many readings.
 
-    - Every motion is a little rougher (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may be
-      rougher without contradicting the readings.
-    - The variance of a motion is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions that the
-      readings hardly separate, the most probable sizes are too small.
+    - Every motion is a little less smooth (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may
+      be rougher without contradicting the readings.
+    - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
+      that the readings hardly separate, the most probable sizes are too small. Ignorance alone makes
+      it at most `IGNORANCE` times the documented one.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
-    rough = np.array([name.startswith("roughness ") for name in model.names])
-    bent = np.array([name in ("fade", "cut") for name in model.names])
+    rough = np.array([name.startswith("smoothness ") for name in model.names])
     sd = np.sqrt(found.spread.diagonal()[: rough.size])
-    c = Components(found.components.psi + np.where(rough, ROUGHER * sd, 0.0), found.components.eta)
-    sizes = model.design * ~(rough | bent)
+    psi = found.components.psi - np.where(rough, ROUGHER * sd, 0.0)
+    psi += np.where(np.array(model.names) == "slope", np.clip(-psi, 0.0, 0.5 * sd**2), 0.0)
+    c = Components(np.clip(psi, model.low, model.high), found.components.eta)
+    sizes = model.design * ~rough
     unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
     factor = np.ones(model.typical.size)
     for at in model.blocks:
-        scale = np.exp(0.25 * unsure[at])
+        scale = np.minimum(np.exp(0.25 * unsure[at]), np.maximum(IGNORANCE / c.half(model)[at], 1.0))
         prior_size = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
         factor[at] = scale * np.hypot(prior_size, SMALLEST_BEND) / prior_size
     return replace(model, root=model.root * factor), c
@@ -348,7 +368,9 @@ def folds(runs: tuple[RunData, ...]) -> I1:
 
 def term_levels(terms: tuple[Term, ...], rest: int) -> I1:
     """Lowest level whose model contains each unknown, shape (p,); -1 for lost motion and set-up, which every model has."""
-    own = [RIGID6 if t.order == 0 or (t.order == 1 and t.component == t.axis) else t.order for t in terms]
+    own = [
+        RIGID6 if t.order == 0 or (t.order == 1 and t.component == t.axis) else t.order if t.order <= SMOOTH_ORDER else -1 for t in terms
+    ]
     return np.array(own + [-1] * rest, dtype=np.int64)
 
 
@@ -378,11 +400,12 @@ def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, l
 def _without_setup(gram: F2, rhs: F1, root: F2, level: I1) -> tuple[F2, F1, float]:
     """Normal equations of the smooth terms with lost motion and set-up integrated out, and the log evidence of that part."""
     terms, rest = np.flatnonzero(level >= 0), np.flatnonzero(level < 0)
-    sd = root.diagonal()[rest]  # independent of each other
-    own = gram[np.ix_(rest, rest)] * sd[:, None] * sd
-    np.fill_diagonal(own, own.diagonal() + 1.0)
-    factor = scipy.linalg.cholesky(own, lower=True, check_finite=False)
-    both = np.column_stack([gram[np.ix_(rest, terms)], rhs[rest]]) * sd[:, None]
+    own = root[np.ix_(rest, rest)]
+    turn = own.T @ gram[rest]
+    inside = turn[:, rest] @ own
+    np.fill_diagonal(inside, inside.diagonal() + 1.0)
+    factor = scipy.linalg.cholesky(inside, lower=True, check_finite=False)
+    both = np.column_stack([turn[:, terms], own.T @ rhs[rest]])
     half = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
     z = half[:, -1]
     fixed = 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum())

@@ -195,9 +195,9 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
             sizes, found = fit_length(whole, sizes, c)
             c = found.components
         elif step:
-            c = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c).components
+            c = estimate(whole.turned(sizes.root, sizes.turned), sizes, c).components
         root = sizes.root * c.half(sizes)
-        before, x = x, root @ posterior(whole.turned(sizes.root, sizes.blocks), c, sizes).x
+        before, x = x, root @ posterior(whole.turned(sizes.root, sizes.turned), c, sizes).x
         size = (z - r.a @ x) / np.exp(0.5 * c.eta)[r.kind]
         if not step:
             size = size / _robust_scale(size, r.kind)[r.kind]
@@ -225,7 +225,7 @@ def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
 
 def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, sizes: SizeModel) -> F1:
     """Standard deviation of each residual in units of its noise, below 1 by the leverage."""
-    information, _, _ = blend(whole.turned(sizes.root, sizes.blocks), c, c.half(sizes))
+    information, _, _ = blend(whole.turned(sizes.root, sizes.turned), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = scipy.linalg.cholesky(information, lower=True)
     h = leverage(problem.readings.a, scipy.linalg.solve_triangular(low, (sizes.root * c.half(sizes)).T, lower=True))
@@ -243,14 +243,33 @@ def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Gr
     parts = tuple(s.decimated(decimation) for s in parts)
     whole = total(parts)
     sizes = problem.sizes
-    found = estimate(whole.turned(sizes.root, sizes.blocks), sizes, c)
+    found = estimate(whole.turned(sizes.root, sizes.turned), sizes, c)
     sizes, c = cautious(sizes, found)
-    p = posterior(whole.turned(sizes.root, sizes.blocks), c, sizes)
+    p = posterior(whole.turned(sizes.root, sizes.turned), c, sizes)
     root = typical[:, None] * sizes.root * c.half(sizes)
     cov = root @ p.cov @ root.T
     theta = root @ p.x
     left = problem.measured - problem.predicted(theta)
     return CampaignFit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, decimation, parts)
+
+
+def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:
+    """Score for further terms whose variance the fit takes as zero, in standard deviations of the score without them.
+
+    Positive if the residuals are more alike where these terms are alike than noise would be: the derivative of the log evidence by the
+    variance of ``terms`` (their prior: `size_model`), over the root of its expected information (Rao's score test).
+    """
+    sizes = size_model(problem.machine, terms, (), np.zeros(0), Priors())
+    columns = np.concatenate([run_design(problem.machine, terms, r, problem.setup)[:, : len(terms)] for r in problem.runs])
+    kind = problem.readings.kind
+    weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
+    b = (columns * sizes.typical / problem.sigma[:, None]) @ sizes.root
+    weighted = b * weight[:, None]
+    root = fit.sizes.root * fit.components.half(fit.sizes)
+    across = weighted.T @ problem.readings.a @ root
+    information = b.T @ weighted - across @ fit.posterior.cov @ across.T
+    asked = weighted.T @ (fit.residual_mm / problem.sigma)
+    return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
 
 
 def _thinning(problem: CampaignProblem, size: F1, weight: F1) -> F1:

@@ -16,11 +16,11 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import DIRECTIONS, Term, smooth_terms
+from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term, rough_terms, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.components import KINDS, RIGID6, OrderChoice, choose, term_levels, total
-from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, settle
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, rough_evidence, settle
 from abbe.models.solvers.least_squares import Identifiability, ParameterEstimate, combinations_of, taking_part
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, hidden_free, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
@@ -28,8 +28,8 @@ from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
-HIGHEST_ORDER = 12
-"""Error motions up to this order are always solved for; those above the order that the runs support are nuisance, held by their prior."""
+ROUGH_EVIDENCE = 5.0
+"""Motions are solved for with their rough parts if the score for these exceeds its expectation by so many standard deviations."""
 Model = Literal["rigid6", "rigid21", "auto"]
 
 
@@ -191,11 +191,16 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         raise ValueError("joint solution: no runs")
     report = progress or _silent
     noise = expected_noise(runs, sigma_mm, floor_mm)
-    terms = _six() if model == "rigid6" else smooth_terms(order or HIGHEST_ORDER)
+    terms = _six() if model == "rigid6" else smooth_terms(order or SMOOTH_ORDER)
     problem = build(machine, terms, runs, priors or Priors(), noise)
     fit = settle(problem, report)
     if model == "rigid6":
         return _solution(problem, fit, "rigid6", 1, None)
+    if order is None and rough_evidence(problem, fit, rough_terms()) > ROUGH_EVIDENCE:
+        report("the readings show error motions that are rough")
+        terms = (*terms, *rough_terms())
+        problem = build(machine, terms, runs, priors or Priors(), noise)
+        fit = settle(problem, report)
     choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
         report("held-out runs support only scales and squareness")

@@ -9,13 +9,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import Term
+from abbe.models.geometry.bases import SMOOTH_ORDER, Term
 from abbe.models.machine import Machine
 
 U_WAVELENGTH = 0.3e-6
@@ -36,6 +37,7 @@ class Priors:
     positioning_mm, straightness_mm : one Legendre coefficient of order 2 and more.
     angle_rad, angle_slope_rad : one coefficient of order 2 and more; of order 1.
     decay_order : coefficients fall with the order as 1 / (1 + (order / decay_order)^2), because machine errors are smooth.
+    rough_mm : rough part of a translational motion (orders above `SMOOTH_ORDER`): pitch of a screw, joints of rails, wear.
     backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; error of a laser run's first record; drift of
         a laser run.
     bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (set with a
@@ -54,6 +56,7 @@ class Priors:
     angle_rad: float = 15e-6
     angle_slope_rad: float = 20e-6
     decay_order: float = 6.0
+    rough_mm: float = 1e-3
     backlash_mm: float = 10e-3
     cup_mm: float = 60e-3
     bar_length_mm: float = 2e-3
@@ -97,12 +100,16 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
-MOTION_FACTOR = 2.0
+LARGEST_SIZE = 5.0
+"""The size of a class is never estimated outside 1 / `LARGEST_SIZE` to `LARGEST_SIZE` times the documented one."""
+MOTION_FACTOR = 2.5
 """Hyperprior of the size of one error motion relative to its class: known within this factor."""
-ROUGHNESS_SD = 0.7
-"""Hyperprior of how the sizes of one motion fall with the order, relative to all motions: some guideways are rougher than others."""
-SPECTRUM_SD = 1.0
-"""Hyperprior of ``fade`` and ``cut``, the two numbers that change how the sizes of all motions fall with the order."""
+LARGEST_MOTION = 5.0
+"""One error motion is never estimated more than this many times as large as its class."""
+SMOOTHNESS_SD = 0.7
+"""Hyperprior of how much faster than documented the sizes of one motion fall with the order; never slower (`SizeModel.low`)."""
+ORDER_SD, LEAST_ORDER, LARGEST_ORDER = 1.0, -6.0, 1.0
+"""Hyperprior and bounds of the log variance of one order, common to all motions: a little larger than documented, or almost nothing."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
 """Set-up unknowns from mounting and temperature, whose typical size is estimated from the data; that of calibrations is not."""
 LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
@@ -110,20 +117,26 @@ LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4
 FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
 """How much the correlation lengths of one machine's motions differ: standard deviation of the logarithm, a factor of 1.5."""
+ENDS_SHARE = 0.1
+"""Share of a motion's variance that is largest at the ends of the stroke: guideways sag and screws bend most there."""
+ROUGH_LENGTH_MM = 30.0
+"""Correlation length of the rough part of a translational motion: between the pitch of a screw and the carriage's length."""
 SMALLEST_BEND = 0.003
 """Least prior standard deviation of a shape of an error motion, as a fraction of the documented size: 15 nm or 0.045 urad."""
 SMALLEST_SHARE = 1e-7
 """Least variance of a shape as a fraction of the largest, so that no shape is ruled out."""
+NODES = 160
+"""Nodes of the quadrature that projects a correlation on Legendre polynomials."""
 
 
 @cache
 def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
     """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
-    An error motion without its straight line is assumed equally large and smooth everywhere on the stroke. Independent Legendre
-    coefficients do not give that, because all polynomials are largest at the ends. So the coefficients are those of a stationary process
-    with a squared exponential correlation of about ``length`` strokes, log-normal with `LENGTH_SPREAD`: a single length would claim to know
-    how a motion continues where nothing was measured. The shapes are the eigenvectors of the coefficients' covariance.
+    The coefficients are those of a stationary process with Matern 3/2 correlation of about ``length`` strokes, log-normal with
+    `LENGTH_SPREAD`, and with `ENDS_SHARE` of its variance in independent coefficients, which are largest at the ends. A smoother
+    correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would then tell its ends. The shapes are
+    the eigenvectors of the coefficients' covariance.
 
     Returns
     -------
@@ -132,18 +145,38 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
     variance : array, shape (order - 1,)
         Of every shape, for a process of variance 1 (before its straight line is removed).
     """
-    u, weight = legendre.leggauss(96)
-    gap = (u[:, None] - u) / 2.0
     spread = np.linspace(-2.0, 2.0, 9)
     share = np.exp(-0.5 * spread**2) / np.exp(-0.5 * spread**2).sum()
-    own = length * np.exp(LENGTH_SPREAD * spread)
-    kernel = np.einsum("s,sij->ij", share, np.exp(-0.5 * (gap / own[:, None, None]) ** 2))
+    scaled = np.sqrt(3.0) * _gaps()[None] / (length * np.exp(LENGTH_SPREAD * spread))[:, None, None]
+    process = _projected(np.einsum("s,sij->ij", share, (1.0 + scaled) * np.exp(-scaled)), 2, order)
     k = np.arange(2, order + 1)
-    project = (k + 0.5)[:, None] * legendre.legvander(u, order)[:, 2:].T * weight
-    values, vectors = np.linalg.eigh(project @ kernel @ project.T)
+    fade = (1.0 + (k / Priors().decay_order) ** 2) ** -2.0
+    ends = fade / (fade / (2.0 * k + 1.0)).sum()
+    values, vectors = np.linalg.eigh((1.0 - ENDS_SHARE) * process + ENDS_SHARE * np.diag(ends))
     values, vectors = values[::-1], vectors[:, ::-1]
     vectors = vectors * np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(k.size)])
     return np.asarray(vectors), np.maximum(values, SMALLEST_SHARE * values[0])
+
+
+@cache
+def rough_root(first: int, last: int, length: float) -> F2:
+    """Root of the prior covariance of a rough motion's Legendre coefficients of order ``first`` to ``last``, for a process of variance 1.
+
+    The process has an exponential correlation of ``length`` strokes: kinks, as of a screw's pitch, a joint of rails, a worn place.
+    """
+    return np.asarray(np.linalg.cholesky(_projected(np.exp(-_gaps() / length), first, last)), dtype=np.float64)
+
+
+def _gaps() -> F2:
+    u, _ = legendre.leggauss(NODES)
+    return np.asarray(np.abs(u[:, None] - u) / 2.0)
+
+
+def _projected(kernel: F2, first: int, last: int) -> F2:
+    """Covariance of the Legendre coefficients of a process with this covariance at the nodes of the quadrature."""
+    u, weight = legendre.leggauss(NODES)
+    project = (np.arange(first, last + 1) + 0.5)[:, None] * legendre.legvander(u, last)[:, first:].T * weight
+    return np.asarray(project @ kernel @ project.T)
 
 
 @dataclass(frozen=True)
@@ -156,65 +189,96 @@ class SizeModel:
         Documented size of every unknown, mm or rad; the unit of this unknown in all other arrays.
     root : array, shape (p, p)
         Unknowns (in units of ``typical``) = ``root`` @ independent unknowns of reference variance 1; a block per error motion
-        (`smooth_shapes`), elsewhere the unit matrix.
-    blocks : tuple of arrays of int
-        Unknowns of each error motion of order 2 and more.
+        (`smooth_shapes`) and per rough part (`rough_root`), elsewhere the unit matrix.
+    blocks, rough : tuple of arrays of int
+        Unknowns of each error motion of order 2 to `SMOOTH_ORDER`; of each rough part, the orders above.
     length : float
         Correlation length of the error motions, strokes.
     names : tuple of str
         Meaning of each number of psi: log variance of a class of unknowns relative to the documented one, of one error motion relative to
-        its class, ``fade`` and ``cut`` of the shapes, roughness of one motion relative to the others.
+        its class, smoothness of one motion, size of one order in all motions.
     design : array, shape (p, h)
-    sd : array, shape (h,)
-        Standard deviation of the normal hyperprior of each number, around 0 (the documented size).
+    sd, low, high : array, shape (h,)
+        Standard deviation of the normal hyperprior of each number, around 0 (the documented size), and its bounds.
     """
 
     typical: F1
     root: F2
     blocks: tuple[NDArray[np.intp], ...]
+    rough: tuple[NDArray[np.intp], ...]
     length: float
     names: tuple[str, ...]
     design: F2
     sd: F1
+    low: F1
+    high: F1
+
+    @property
+    def turned(self) -> tuple[NDArray[np.intp], ...]:
+        """All blocks in which ``root`` differs from the unit matrix."""
+        return self.blocks + self.rough
 
 
 def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...], rest_sd: F1, priors: Priors) -> SizeModel:
-    """Build the size model of the smooth ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
+    """Build the size model of the machine's ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
 
-    Each class shares one size: positioning errors of order 2 and more, straightness errors, angles, lost motions, cups and so on. The data
-    on some members thus tell how large the others may be, and each error motion may differ from its class. How sizes fall with the order
-    is common to all motions, except for each motion's roughness. Scales, squareness errors and slopes of angles keep their documented
-    size: an error common to all scales (temperature) does not show in their differences, and straight guideways tell nothing about the one
-    whose twist no reading shows.
+    Each class shares one size: positioning errors of order 2 and more, straightness errors, angles, slopes of angles, rough parts, lost
+    motions, cups and so on. The data on some members thus tell how large the others may be, and each error motion may differ from its
+    class. How sizes fall with the order is learned for all motions together and for each. Scales and squareness errors keep their
+    documented size: an error common to all scales (temperature) does not show in their differences. All numbers are bounded, so that no
+    data make a size grow with the order, or beyond what machines have.
     """
     kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
-    motions = [t.motion if t.order >= 2 else "" for t in terms] + [""] * len(rest)
-    parts = [(kinds, 2.0 * np.log(SIZE_FACTOR)), (motions, 2.0 * np.log(MOTION_FACTOR))]
-    names, columns, sd = [], [], []
-    for labels, width in parts:
-        for name in dict.fromkeys(v for v in labels if v):
-            names.append(name)
-            columns.append(np.array([float(v == name) for v in labels]))
-            sd.append(width)
-    order = np.array([max(t.order, 2) for t in terms] + [2] * len(rest), dtype=np.float64)
-    if order.max(initial=2.0) > 3.0:
-        names += ["fade", "cut"]
-        columns += [-2.0 * np.log(order / 2.0), -(order**2 - 4.0) / 36.0]
-        sd += [SPECTRUM_SD, SPECTRUM_SD]
-        for name in dict.fromkeys(v for v in motions if v):
-            names.append(f"roughness {name}")
-            columns.append(2.0 * np.log(order / 2.0) * np.array([float(v == name) for v in motions]))
-            sd.append(ROUGHNESS_SD)
-    design = np.stack(columns, axis=1) if columns else np.zeros((len(kinds), 0))
+    motion = np.array([t.motion if 2 <= t.order <= SMOOTH_ORDER else "" for t in terms] + [""] * len(rest))
+    numbers = _classes(kinds) + _motions(motion, np.array([t.order for t in terms] + [0] * len(rest)))
+    design = np.array([n.column for n in numbers]).reshape(len(numbers), motion.size).T
+    sd, low, high = np.array([n.bounds for n in numbers]).reshape(-1, 3).T
+    blocks = tuple(np.flatnonzero(motion == m) for m in dict.fromkeys(motion) if m)
+    rough, root = _rough_parts(machine, terms, motion.size)
     typical = np.concatenate([_reference(machine, terms, priors), rest_sd])
-    motion = np.array(motions)
-    blocks = tuple(np.flatnonzero(motion == m) for m in dict.fromkeys(motions) if m)
-    return with_length(SizeModel(typical, np.eye(typical.size), blocks, FIRST_LENGTH, tuple(names), design, np.array(sd)), FIRST_LENGTH)
+    names = tuple(n.name for n in numbers)
+    return with_length(SizeModel(typical, root, blocks, rough, FIRST_LENGTH, names, design, sd, low, high), FIRST_LENGTH)
+
+
+class _Number(NamedTuple):
+    """One number of psi: its column of the design; standard deviation, lower and upper bound."""
+
+    name: str
+    column: F1
+    bounds: tuple[float, float, float]
+
+
+def _classes(kinds: list[str]) -> list[_Number]:
+    bounds = (2.0 * np.log(SIZE_FACTOR), -2.0 * np.log(LARGEST_SIZE), 2.0 * np.log(LARGEST_SIZE))
+    return [_Number(k, np.array([float(v == k) for v in kinds]), bounds) for k in dict.fromkeys(kinds) if k]
+
+
+def _motions(motion: NDArray[np.str_], order: NDArray[np.int64]) -> list[_Number]:
+    """Size and smoothness of every motion, and the size of every order."""
+    names = [str(m) for m in dict.fromkeys(motion) if m]
+    bounds = (2.0 * np.log(MOTION_FACTOR), -2.0 * np.log(LARGEST_SIZE), 2.0 * np.log(LARGEST_MOTION))
+    out = [_Number(m, (motion == m).astype(np.float64), bounds) for m in names]
+    if not names or order[motion != ""].max() < 4:
+        return out
+    fall = -2.0 * np.log(np.maximum(order, 2) / 2.0)
+    out += [_Number(f"smoothness {m}", fall * (motion == m), (SMOOTHNESS_SD, 0.0, np.inf)) for m in names]
+    orders = range(4, int(order[motion != ""].max()) + 1)
+    levels = [((order == k) & (motion != "")).astype(np.float64) for k in orders]
+    return out + [_Number(f"order {k}", v, (ORDER_SD, LEAST_ORDER, LARGEST_ORDER)) for k, v in zip(orders, levels, strict=True)]
+
+
+def _rough_parts(machine: Machine, terms: tuple[Term, ...], p: int) -> tuple[tuple[NDArray[np.intp], ...], F2]:
+    root, motion = np.eye(p), np.array([t.motion if t.order > SMOOTH_ORDER else "" for t in terms])
+    parts = tuple(np.flatnonzero(motion == m) for m in dict.fromkeys(motion) if m)
+    for at in parts:
+        first, last = terms[at[0]], terms[at[-1]]
+        root[np.ix_(at, at)] = rough_root(first.order, last.order, ROUGH_LENGTH_MM / float(machine.length_mm[first.axis]))
+    return parts, root
 
 
 def with_length(model: SizeModel, length: float) -> SizeModel:
     """Return the size model with another correlation length of the error motions, strokes."""
-    root = np.eye(model.typical.size)
+    root = model.root.copy()
     for at in model.blocks:
         shapes, variance = smooth_shapes(at.size + 1, length)
         root[np.ix_(at, at)] = shapes * np.sqrt(variance)
@@ -228,6 +292,8 @@ def _reference(machine: Machine, terms: tuple[Term, ...], p: Priors) -> F1:
 
 def _bend_size(term: Term, p: Priors) -> float:
     """Prior standard deviation of an error motion at a point of its stroke, mm or rad."""
+    if term.order > SMOOTH_ORDER:
+        return p.rough_mm
     if term.component >= 3:
         return p.angle_rad
     return p.positioning_mm if term.component == term.axis else p.straightness_mm
@@ -236,8 +302,10 @@ def _bend_size(term: Term, p: Priors) -> float:
 def _class(term: Term) -> str:
     if term.order == 0:
         return ""
+    if term.order > SMOOTH_ORDER:
+        return "rough"
     if term.component >= 3:
-        return "" if term.order == 1 else "angle"
+        return "slope" if term.order == 1 else "angle"
     if term.component == term.axis:
         return "" if term.order == 1 else "positioning"
     return "straightness"

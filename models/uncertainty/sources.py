@@ -15,7 +15,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import Term, smooth_terms
+from abbe.models.geometry.bases import SMOOTH_ORDER, Term, smooth_terms
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution, kept
 from abbe.models.solvers.observations import RunData
@@ -176,7 +176,7 @@ def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term
     The prediction leaves out the orders above. So the values that the residuals suggest for them do not correct it; they count in full as
     uncertainty, as one more column of the factor.
     """
-    above = omitted_terms(max((t.order for t in solution.terms), default=0), orders_above)
+    above = omitted_terms(solution.terms, orders_above)
     terms = (*solution.terms, *above)
     if not above:
         return terms, np.zeros((len(terms), 0))
@@ -200,9 +200,12 @@ def chosen_order(solution: JointSolution) -> int:
     return solution.order
 
 
-def omitted_terms(order: int, orders_above: int) -> tuple[Term, ...]:
-    """Terms of the ``orders_above`` Legendre orders above ``order``."""
-    return tuple(t for t in smooth_terms(order + orders_above) if t.order > order) if orders_above else ()
+def omitted_terms(terms: tuple[Term, ...], orders_above: int) -> tuple[Term, ...]:
+    """Terms of the ``orders_above`` Legendre orders above the highest one of each error motion, or of the model if it lacks the motion."""
+    order = {t.motion: t.order for t in sorted(terms, key=lambda t: t.order) if t.order}
+    model = max((v for v in order.values() if v <= SMOOTH_ORDER), default=0)
+    candidates = smooth_terms(max(order.values(), default=0) + orders_above) if orders_above else ()
+    return tuple(t for t in candidates if 0 < t.order - order.get(t.motion, model) <= orders_above)
 
 
 def omitted_prior_sd(solution: JointSolution, above: tuple[Term, ...]) -> F1:

@@ -263,6 +263,7 @@ class SolutionFile(FileObject):
     holds_at: str | None = Field(default=None, description="scales' temperature at which solution and tables hold")
     motions: dict[str, MotionValue]
     rank: Rank
+    rough: list[str] = Field(default_factory=list, description="which motions are rough, with length or period and remedy")
     not_observable: list[str]
     advice: list[str]
     observability: ObservabilityNumber

@@ -13,7 +13,7 @@ from itertools import product
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.compensation.additive import additive
+from abbe.models.compensation.additive import additive, diagonal_order
 from abbe.models.compensation.grid import FIT_SAMPLES, cells, nodes_mm
 from abbe.models.functions.legendre import legendre_values
 from abbe.models.functions.motions import PLACES, SQUARENESS
@@ -128,7 +128,9 @@ def table_values(
     x, y, z = (np.concatenate([at for at, _ in fits[a]]) for a in range(3))
     order = max(t.order for t in known.terms) + 1
     asked = [_chebyshev(s, order + 1) if smooth else p for s, p in zip(stroke, (x, y, z), strict=True)]
-    found_ = additive(lambda p: field(p)[:, :, None], stroke, (asked[0], asked[1], asked[2]), nodes=NODES, order=order)
+    found_ = additive(
+        lambda p: field(p)[:, :, None], stroke, (asked[0], asked[1], asked[2]), nodes=NODES, order=diagonal_order(known.terms)
+    )
     effects = [e[:, :, 0] for e in found_]
     if smooth:
         bases = [(legendre_values(asked[a], stroke[a], order), legendre_values(p, stroke[a], order)) for a, p in enumerate((x, y, z))]

@@ -14,6 +14,7 @@ from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.volume import GOOD, USABLE, Number
 from abbe.models.solvers.residuals import Outlier
+from abbe.models.solvers.roughness import rough_lines
 from abbe.models.uncertainty.prediction import (
     Budget,
     BudgetLine,
@@ -200,6 +201,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         mean_over_volume_note=f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
         rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),
+        rough=list(rough_lines(joint)),
         not_observable=not_observable(found),
         advice=[a.text for a in o.advice],
         observability=ObservabilityNumber(

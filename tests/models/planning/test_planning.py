@@ -9,6 +9,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+import scipy
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -70,8 +71,9 @@ def test_the_information_of_separate_mountings_adds_up_to_the_posterior_of_the_j
     setup = setup_unknowns(tuple(runs), Priors())
     a = np.concatenate([run_design(MACHINE, what.terms, r, setup) for r in runs]) / np.hypot(0.3e-3, 0.3e-3)
     n = len(what.terms)
-    sd = np.concatenate([what.prior_sd[: n + len(DIRECTIONS)], setup.prior_sd])
-    whole = np.linalg.inv((a * sd).T @ (a * sd) + np.eye(len(sd)))[:n, :n]
+    shared = n + len(DIRECTIONS)
+    root = scipy.linalg.block_diag(what.root[:shared, :shared], np.diag(setup.prior_sd))
+    whole = np.linalg.inv((a @ root).T @ (a @ root) + np.eye(len(root)))[:n, :n]
     assert np.linalg.inv(added)[:n, :n] == pytest.approx(whole, abs=1e-9)
 
 

@@ -10,7 +10,10 @@ from abbe.models.solvers.components import Components, FittedComponents, Informa
 from abbe.models.solvers.priors import SMALLEST_BEND, Priors, SizeModel, size_model, smooth_shapes
 from tests.models.solvers.truth import MACHINE
 
-SIZES = SizeModel(np.ones(6), np.eye(6), (), 0.5, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), np.array([2.0, 2.0]))
+FREE = np.full(2, np.inf)
+SIZES = SizeModel(
+    np.ones(6), np.eye(6), (), (), 0.5, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), sd=np.array([2.0, 2.0]), low=-FREE, high=FREE
+)
 
 
 def problem(seed=0, n=(40, 25)):
@@ -61,11 +64,11 @@ def test_noise_and_sizes_come_back_without_bias():
 def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nanometres():
     model = size_model(MACHINE, smooth_terms(6), (), np.ones(0), Priors())
     n, h = model.typical.size, model.sd.size
-    small = Components(np.array([-12.0 * (name == "angle") for name in model.names]), np.zeros(2))
+    small = Components(np.array([-14.0 * (name == "angle") for name in model.names]), np.zeros(2))
     found = [cautious(model, FittedComponents(small, v * np.eye(h + 2), 0.0)) for v in (1e-12, 0.5)]
     before, known, unknown = (np.linalg.norm(m.root * c.half(m), axis=1) for m, c in ((model, small), *found))
     at = np.concatenate(model.blocks)
-    rest = np.setdiff1d(np.arange(n), at)
+    rest = np.setdiff1d(np.arange(n), np.r_[at, np.flatnonzero(model.design[:, model.names.index("slope")])])
     assert before[at].min() < 0.2 * SMALLEST_BEND
     assert known[at].min() >= SMALLEST_BEND
     large = at[before[at] > 0.1]
@@ -74,12 +77,12 @@ def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nano
     assert (unknown[rest] == before[rest]).all()
 
 
-def test_an_error_motion_is_equally_large_at_the_ends_and_in_the_middle():
+def test_an_error_motion_is_at_most_twice_as_large_at_the_ends_as_in_the_middle():
     shapes, variance = smooth_shapes(12, 0.25)
     u = np.linspace(-1.0, 1.0, 21)
     sd = np.linalg.norm(legendre.legvander(u, 12)[:, 2:] @ (shapes * np.sqrt(variance)), axis=1)
     independent = np.linalg.norm(legendre.legvander(u, 12)[:, 2:] * np.linalg.norm(shapes * np.sqrt(variance), axis=1), axis=1)
-    assert sd.max() / np.median(sd) < 1.8  # a line was taken away: a little more is left at the ends
+    assert sd.max() / np.median(sd) < 2.1  # a line was taken away, and a tenth of the variance is largest there
     assert independent.max() / np.median(independent) > 1.5 * sd.max() / np.median(sd)
 
 
@@ -90,5 +93,4 @@ def test_stated_calibrations_scales_and_squareness_are_never_learned():
     free = {n for n, row in zip(names, model.design[len(terms) :], strict=True) if row.any()}
     assert free == {"backlash_X", "cup_a_x", "tilt_a_1"}
     fixed = {t.name for t, row in zip(terms, model.design, strict=False) if not row.any()}
-    slopes = {f"E{c}{a}.1" for c in "ABC" for a in "XYZ"}
-    assert fixed == {"EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z"} | slopes
+    assert fixed == {"EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z"}

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.geometry.bases import SMOOTH_ORDER
 from abbe.models.solvers.components import folds
 from abbe.models.solvers.engine import repeat_noise_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
@@ -33,7 +34,7 @@ def test_noise_is_found_from_repeats_and_with_the_solution(runs, clean):
 
 def test_the_order_is_chosen_and_what_lies_above_stays_as_nuisance(clean):
     assert 3 <= clean.order <= 10
-    assert max(t.order for t in clean.terms) == 12
+    assert max(t.order for t in clean.terms) == SMOOTH_ORDER
     assert clean.identifiability.n_parameters == 18 * clean.order - 3
     c = clean.order_choice
     assert c is not None
