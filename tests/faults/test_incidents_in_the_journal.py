@@ -92,7 +92,7 @@ async def test_show_tells_a_campaigns_incidents_and_how_they_ended(place: Place)
     (run,) = await measure(place.bench.session, place.store, place.bench.site, plan, options=MeasureOptions(control))
     shown = await asyncio.to_thread(CliRunner().invoke, app, ["show", "c", "--db", place.url])
     assert "incidents on the links to devices: 1" in shown.stdout
-    assert re.search(rf"controller +DRV-002 +1 +recovered 1 +run {run} test", shown.stdout)
+    assert re.search(rf"controller\s+DRV-002\s+1\s+recovered 1\s+run {run} test", shown.stdout)
     told = json.loads((await asyncio.to_thread(CliRunner().invoke, app, ["show", "c", "--db", place.url, "--json"])).stdout)
     assert [(one["code"], one["times"], one["ends"]) for one in told["incidents"]] == [("DRV-002", 1, {"recovered": 1})]
     assert [(one["number"], one["run_id"], one["test"], one["status"]) for one in told["runs"]] == [

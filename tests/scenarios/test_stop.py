@@ -101,7 +101,8 @@ def test_a_signal_stops_the_axes(measuring, number, code):
     assert process.returncode == code, err
     assert axes_at_rest(measuring.sims)
     assert "Traceback" not in err
-    assert err.splitlines()[-1].startswith("helix"), err  # nothing but the progress line: the stop got through
+    assert err.splitlines()[-2].startswith("helix"), err  # nothing but the progress line and the next command: the stop got through
+    assert err.splitlines()[-1].startswith("next: abbe measure --resume "), err
     run = runs_of(measuring.folder)[-1]
     assert (run.status, run.reason) == ("aborted", "stopped")
 

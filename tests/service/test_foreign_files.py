@@ -58,10 +58,8 @@ def test_a_link_to_a_file_is_as_good_as_the_file(abbe: Abbe, campaign_folder: Pa
 
 def test_a_file_in_place_of_a_folder_is_said_so(abbe: Abbe, campaign_folder: Path) -> None:
     said = abbe.fails("import", campaign_folder / "campaign.json")
-    assert said == (
-        f"error FMT-001: {campaign_folder / 'campaign.json'} is a file, expected a folder"
-        " - give the folder that holds campaign.json and its run files\n"
-    )
+    assert said.startswith("error FMT-001: campaign.json: files ")
+    assert said.endswith(" can be imported, and folders with campaign.json - give one of these\n")
 
 
 def test_bytes_are_counted_as_they_come(tmp_path: Path) -> None:

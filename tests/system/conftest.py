@@ -22,7 +22,7 @@ def chromium() -> Iterator[Browser]:
 @pytest.fixture
 def refused(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Callable[..., list[str]]:
     """What ``abbe serve`` says when it does not begin; the logs of the tests stay as they are."""
-    monkeypatch.setattr("abbe.service.logs.configure_logs", lambda: None)
+    monkeypatch.setattr("abbe.service.logs.configure_logs", lambda **_: None)
 
     def lines(file: Path, *words: str) -> list[str]:
         assert cli.run(["serve", "-m", str(file), *words]) == 2

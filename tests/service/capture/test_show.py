@@ -102,7 +102,7 @@ async def test_which_streams_a_run_has_it_says_itself(url: str, finish: bool) ->
     with Store.open(url) as store:
         assert store.runs.find("r01").end_doc["capture"]["streams"] == [[0, 0, 0], [1, 1, 1]]
     shown = tell("show", "r01", "--db", url)
-    assert re.search(r"streams +2 *\n", shown)
+    assert re.search(r"streams\s+2 *\n", shown)
     assert "60 in 1 gaps" in shown
     assert "samples 0 to 59" in shown
     assert "unaccounted" not in shown

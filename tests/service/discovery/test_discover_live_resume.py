@@ -146,7 +146,7 @@ class Bench:
             return controller_status(self.conditions, ctrl_us=round(1e6 * self.now_s) + 1_000_000 * len(self.measured))
 
         async def comp_status() -> Any:
-            return SimpleNamespace(boot_id=self.boot, bank_crc=(1, 2), active_bank=0)
+            return SimpleNamespace(boot_id=self.boot, bank_crc=(1, 2), active_bank=0, gen=1)
 
         async def abort() -> None:
             """A hold that a killed process may have left is taken away; nothing moves here."""
