@@ -7,7 +7,7 @@ import os
 import re
 import shlex
 import sys
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -227,5 +227,6 @@ def conclude(then: str, *, machine: Path | None = None, db: str | None = None, v
     named = "" if machine is None else f" -m {shlex.quote(str(machine))}"
     named += "" if db is None else f" --db {shlex.quote(mask_secrets(db))}"
     sys.stdout.flush()
-    for line in filter(None, (verdict, f"next: {then}{named}")):
-        sys.stderr.write(visible(line) + "\n")
+    with suppress(OSError):  # the terminal may be gone
+        for line in filter(None, (verdict, f"next: {then}{named}")):
+            sys.stderr.write(visible(line) + "\n")
