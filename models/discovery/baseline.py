@@ -18,7 +18,7 @@ from abbe.models.solvers.priors import Priors, smooth_shapes, term_prior_sd
 ORDER = 14
 """Highest Legendre order of each error motion. With 7 coefficients, cases without a missing effect gave false discoveries; with 10 to 18
 none did."""
-LENGTH = 0.8
+LENGTH = 1.35
 """Correlation length of the error motions, strokes, for predictions."""
 BAR = "bar_length"
 CUP_MM, BAR_MM, TILT_RAD, ZERO_MM = 60e-3, 20e-3, 1e-3, 20e-3
