@@ -101,7 +101,7 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
 LARGEST_SIZE = 5.0
-"""The size of a class is never estimated outside 1 / `LARGEST_SIZE` to `LARGEST_SIZE` times the documented one."""
+"""The size of a class is never estimated above `LARGEST_SIZE` times the documented one, that of error motions never below 1 / as much."""
 MOTION_FACTOR = 2.5
 """Hyperprior of the size of one error motion relative to its class: known within this factor."""
 LARGEST_MOTION = 5.0
@@ -249,8 +249,11 @@ class _Number(NamedTuple):
 
 
 def _classes(kinds: list[str]) -> list[_Number]:
-    bounds = (2.0 * np.log(SIZE_FACTOR), -2.0 * np.log(LARGEST_SIZE), 2.0 * np.log(LARGEST_SIZE))
-    return [_Number(k, np.array([float(v == k) for v in kinds]), bounds) for k in dict.fromkeys(kinds) if k]
+    """Size of every class; a set-up may be better than usual by any factor, because its unknowns are no shapes that could explode."""
+    high = 2.0 * np.log(LARGEST_SIZE)
+    low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else -high for k in kinds}
+    bounds = {k: (2.0 * np.log(SIZE_FACTOR), low[k], high) for k in kinds}
+    return [_Number(k, np.array([float(v == k) for v in kinds]), bounds[k]) for k in dict.fromkeys(kinds) if k]
 
 
 def _motions(motion: NDArray[np.str_], order: NDArray[np.int64]) -> list[_Number]:
