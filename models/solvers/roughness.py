@@ -181,13 +181,27 @@ class _Search:
         gain = np.array([f[0] for f in fits])
         k = int(np.clip(np.argmax(gain), 1, len(close) - 2))
         bend = gain[k - 1] - 2.0 * gain[k] + gain[k + 1]
-        if gain[k] < LEAST_GAIN or bend >= 0.0:
+        if gain[k] < LEAST_GAIN or bend >= 0.0 or self._rival(rest, axis, component, float(close[k])) > RIVAL * gain[k]:
             return None
         step = close[1] - close[0]
         at = close[k] + 0.5 * step * (gain[k - 1] - gain[k + 1]) / bend
         u = float(np.sqrt(-2.0 / bend)) * step  # chi squared rises by 1
         _, explained, amplitude, u_amplitude = self._exact(rest, axis, component, at)
         return Period(name, amplitude, u_amplitude, 1.0 / float(at), u / float(at) ** 2), explained
+
+    def _rival(self, rest: F1, axis: int, component: int, frequency: float) -> float:
+        """Largest gain of any other frequency, with everything else that the solution has refitted."""
+        length = float(self.solution.machine.length_mm[axis])
+        other = np.arange(1.0 / LONGEST_MM, 1.0 / SHORTEST_MM, 0.4 / length)
+        other = other[np.abs(other - frequency) > 2.0 / length]
+        cosine, sine = self._waves(axis, component, other)
+        across = [wave.T @ self.columns for wave in (cosine, sine)]
+        taken = [a @ self.covariance for a in across]
+        cc, ss = ((w**2).sum(0) - (t * a).sum(1) for w, t, a in zip((cosine, sine), taken, across, strict=True))
+        cs = (cosine * sine).sum(0) - (taken[0] * across[1]).sum(1)
+        c, s = rest @ cosine, rest @ sine
+        gain = (ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.maximum(cc * ss - cs**2, 1e-3 * cc * ss + 1e-9)
+        return float(gain.max(initial=0.0))
 
     def _exact(self, rest: F1, axis: int, component: int, frequency: float) -> tuple[float, F1, float, float]:
         """Gain with everything else that the solution has refitted, the readings explained, amplitude and its standard uncertainty."""
