@@ -246,7 +246,7 @@ def finding(
         effects=judgement.effects if is_named else (),
         location=location,
         next_test=_next_test(problem, judgement.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
-        gaps=scattered(gaps) if is_named and {e.label for e in judgement.effects} & {f.label for f in loud} else gaps,
+        gaps=scattered(gaps) if is_named and judgement.mean and len(judgement.effects) > len(judgement.mean) else gaps,
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
         predicted_mm=predicted[1],

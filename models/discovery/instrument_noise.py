@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import combinations
 from math import comb
 
 import numpy as np
@@ -18,6 +19,8 @@ SHARE, MEMORY = 0.1, 0.75
 SHARES, MEMORIES = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95), (0.5, 0.75, 0.9, 0.96, 0.985)
 """Colours tried for noise that remembers more than usual, such as 1/f noise."""
 REMEMBERS, MOST, LOUDEST = 60.0, 0.8, 4.0
+SAME_MM, AGAIN = 1.0, 0.2
+"""Runs follow the same path if they are never farther apart; mean correlation of their residuals from which these are not noise."""
 CLEARLY = 0.85
 """The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
 FINE, QUIET, SHORTEST = 4, 0.25, 24
@@ -96,6 +99,20 @@ def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colou
         if gain > REMEMBERS and np.mean(best > usual) > MOST:
             out[kind] = Colour(colour.sd_mm, share, memory, gain)
     return out
+
+
+def comes_back(paths: Sequence[Path], residual: Sequence[F1], kind: str) -> bool:
+    """Whether residuals of an instrument come back in runs along the same path (`AGAIN`), or no two runs can tell; then they are no noise.
+
+    ``residual``: one array (n,) per run.
+    """
+    runs = [(p, r) for p, r in zip(paths, residual, strict=True) if p.kind == kind and p.n >= SHORTEST]
+    alike = [
+        float(np.corrcoef(one, other)[0, 1])
+        for (p, one), (q, other) in combinations(runs, 2)
+        if p.n == q.n and np.abs(p.at.q_mm - q.at.q_mm).max() < SAME_MM
+    ]
+    return not alike or float(np.mean(alike)) > AGAIN
 
 
 def _as_read(whitened: F1, colour: Colour) -> F1:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import Baseline
 from abbe.models.discovery.case import Case, CaseRun
-from abbe.models.discovery.instrument_noise import Colour, beside_turns, level, lone, remembered, unscaled
+from abbe.models.discovery.instrument_noise import Colour, beside_turns, comes_back, level, lone, remembered, unscaled
 from abbe.models.effects.effect import Signal, Values
 from abbe.models.effects.path import Path
 
@@ -310,7 +310,9 @@ def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]
         use = problem.use * problem.lone(left)
         colours = level(left, lengths, kinds, use, projection.leverage, problem.case.resolution_mm, problem.colours)
         if memory and k == 0:
-            colours = remembered(left, lengths, kinds, colours)
+            wander = remembered(left, lengths, kinds, colours)
+            parts = problem.by_run(left)
+            colours = {kind: c if comes_back(problem.paths, parts, kind) else wander[kind] for kind, c in colours.items()}
         other = any(colours[kind].gain != problem.colours[kind].gain for kind in colours)
         if other or (use != problem.use).any():
             problem = replace(problem, use=use, tangent=Tangent.of(problem.tangent.raw, use, lengths, kinds, colours))

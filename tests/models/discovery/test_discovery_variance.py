@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import scipy
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.instrument_noise import Colour, lone, remembered, unscaled
+from abbe.models.discovery.instrument_noise import Colour, comes_back, lone, remembered, unscaled
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, contaminated, extra_variance
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import bar, campaign, circle, noise
@@ -172,3 +174,12 @@ def test_a_place_where_the_machine_is_off_is_no_lost_beam() -> None:
     assert first.label == "unnamed_place"
     assert first.location.position_mm is not None
     assert np.linalg.norm(np.array(first.location.position_mm) - corner) < 30.0
+
+
+def test_what_comes_back_in_runs_along_the_same_path_is_no_noise() -> None:
+    rng = np.random.default_rng(12)
+    paths = (PATHS[0], replace(PATHS[0], label="again"))
+    wander = [scipy.signal.lfilter([1.0], [1.0, -0.9], rng.normal(size=PATHS[0].n)) for _ in paths]
+    assert not comes_back(paths, wander, "bar")
+    assert comes_back(paths, [w + 5.0 * wander[0] for w in wander], "bar")
+    assert comes_back(paths[:1], wander[:1], "bar")  # one run cannot tell
