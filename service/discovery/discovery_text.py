@@ -105,14 +105,22 @@ def _remainder_text(finding: Finding) -> str:
 def _proof_text(judged: Judgement) -> str:
     """Tell how far the gap closed on the holdout runs."""
     assert judged.gap is not None  # a proof needs a gap
-    before, after, _ = _gap_values(judged.gap)
-    return f"also on runs that were never fitted, from {before} to {after} µm rms ({judged.closed:.0%} closed)"
+    return f"also on runs that were never fitted, {_judging_text(judged.gap)}"
+
+
+def _judging_text(gap: GapUm) -> str:
+    """Figures of runs that were never fitted; only of these a closed share is said, because fitted runs flatter."""
+    before, after, floor = _gap_values(gap)
+    share = "" if gap.closed is None else f" ({max(gap.closed, 0.0):.0%} closed)"
+    return f"from {before} to {after} µm rms where {floor} µm is noise{share}"
 
 
 def _suspect_text(finding: Finding) -> str:
     """List the effects that the holdout runs do not confirm; empty without any."""
     names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.suspects)
-    return f" Suspected: {names}; but {finding.proof}." if names else ""
+    judging = finding.gaps.get("holdout")
+    figures = "" if judging is None else f" ({_judging_text(judging)})"
+    return f" Suspected: {names}; but {finding.proof}{figures}." if names else ""
 
 
 def _repeatability_text(finding: Finding) -> str:
@@ -136,8 +144,7 @@ def _gap_text(finding: Finding) -> str:
         return f"readings scatter by {before} µm rms, more than the noise of {floor} µm, and no model can remove scatter"
     if not finding.effects:
         return f"the gap between measured and simulated is {before} µm rms where {floor} µm is noise"
-    share = "" if gap.closed is None else f" ({gap.closed:.0%} closed)"
-    return f"the gap shrinks from {before} to {after} µm rms where {floor} µm is noise{share}"
+    return f"in the fitted runs the gap shrinks from {before} to {after} µm rms where {floor} µm is noise"
 
 
 def lines_of(finding: Finding) -> list[str]:

@@ -189,13 +189,16 @@ def _card(effect: EffectFound) -> dict[str, str]:
 
 
 def gap_table(finding: Finding) -> TextTable:
-    """Table of the gap (measured minus simulated) by role of the runs. Sealed runs are only counted: their readings are unknown here."""
+    """Table of the gap (measured minus simulated) by role of the runs; a closed share only of runs that were never fitted.
+
+    Sealed runs are only counted: their readings are unknown here.
+    """
     only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap
     by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"
     head = ("Runs", "Before (µm)", "After (µm)", "Noise floor (µm)", f"Gap closed{by}", "What they are for")
     rows: list[tuple[str, ...]] = []
     for role, g in finding.gaps.items():
-        closed = NOT_AVAILABLE if only_scatter or g.closed is None else f"{100.0 * g.closed:.0f} %"
+        closed = NOT_AVAILABLE if only_scatter or g.closed is None or role == "identify" else f"{100.0 * g.closed:.0f} %"
         rows.append((role, plain(g.before_um), plain(g.after_um), plain(g.floor_um), closed, ROLES.get(role, "")))
     sealed = sum(r.role == "sealed" for r in finding.runs.values())
     if sealed:
