@@ -23,7 +23,7 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
 
 I1 = NDArray[np.int64]
-KINDS = ("bar", "laser")
+KINDS = ("bar", "laser", "artefact")
 """Instruments whose noise is estimated separately."""
 NOISE_SD = 2.0
 """Weak hyperprior of an instrument's log noise variance about the expected one: a factor of e in the standard deviation."""
@@ -357,7 +357,7 @@ def folds(runs: tuple[RunData, ...]) -> I1:
     """Fold of each run, shape (runs,): all runs of a set-up share a fold, and each instrument is spread evenly over the folds."""
     out = np.zeros(len(runs), dtype=np.int64)
     place: dict[str, int] = {}
-    for kind in ("bar", "laser"):
+    for kind in KINDS:
         for run in runs:
             if run.kind == kind and run.setup not in place:
                 place[run.setup] = len(place) % FOLDS

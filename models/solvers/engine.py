@@ -34,7 +34,7 @@ from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setu
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
 from abbe.models.solvers.residuals import inflation, leverage, outlier_threshold, outlier_weights, robust_scale
 
-DEFAULT_SIGMA_MM = {"bar": 4e-4, "laser": 3e-4}
+DEFAULT_SIGMA_MM = {"bar": 4e-4, "laser": 3e-4, "artefact": 5e-4}
 """Standard uncertainty of one reading where nothing was repeated: makers' figures for good instruments."""
 RESOLUTION_MM = 5e-5
 """Smallest standard uncertainty of an averaged value: the resolution of displays and encoders."""
@@ -49,7 +49,7 @@ def repeat_noise_mm(runs: tuple[RunData, ...], kind: str) -> float | None:
     equal positions of one run, lost motion and drift removed; fourth differences if every position was visited once. The median makes
     outliers harmless.
     """
-    found = [v for run in runs if run.kind == kind for v in (_of_run(run),) if v.size]
+    found = [v for run in runs if run.kind == kind != "artefact" for v in (_of_run(run),) if v.size]
     values = np.concatenate(found) if found else np.zeros(0)
     if values.size < FEWEST_REPEATS:
         return None

@@ -8,9 +8,10 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.models.solvers.artefact import ArtefactPoints
 
-Kind = Literal["bar", "laser"]
-Test = Literal["", "helix", "circle", "diagonal", "linear"]
+Kind = Literal["bar", "laser", "artefact"]
+Test = Literal["", "helix", "circle", "diagonal", "linear", "artefact"]
 
 REJECT_SIGMA = 5.0
 """A reading farther from its block's median than this many robust standard deviations is left out of the block's mean."""
@@ -29,11 +30,12 @@ class RunData:
     ----------
     label, setup : str
         Run name; set-up name (runs with the same set-up share its unknowns).
-    kind : "bar" | "laser"
+    kind : "bar" | "laser" | "artefact"
     axes_mm : array, shape (n, 3)
         Commanded coordinates.
     deviation_mm : array, shape (n,)
-        Bar length minus radius, or displacement since the first record minus nominal.
+        Bar length minus radius, displacement since the first record minus nominal, or one component of
+        an artefact's point.
     sign : array, shape (n, 3)
         Direction in which each axis last moved (`abbe.models.geometry.chain.travel_sign`).
     t_s : array, shape (n,)
@@ -50,7 +52,8 @@ class RunData:
         Whether the bar's length was calibrated at all; None: the run does not say (`abbe.models.solvers.priors.bar_length_sd`).
     tool_mm : array, shape (3,), optional
         Vector from the spindle reference to the functional point in this run; None: the machine's own tool.
-    test : "helix" | "circle" | "diagonal" | "linear" | ""
+    points : ArtefactPoints, for an artefact
+    test : "helix" | "circle" | "diagonal" | "linear" | "artefact" | ""
         Kind of test, for display and to compare runs; the reading depends only on ``kind`` and the positions.
     rejected : int
         Number of raw readings that `block_average` left out.
@@ -70,6 +73,7 @@ class RunData:
     u_length_mm: float | None = None
     length_calibrated: bool | None = None
     tool_mm: F1 | None = None
+    points: ArtefactPoints | None = None
     test: Test = ""
     rejected: int = 0
 
@@ -78,8 +82,10 @@ class RunData:
         _check_columns(self)
         if self.kind == "bar":
             _check_bar(self)
-        else:
+        elif self.kind == "laser":
             _check_beam(self)
+        elif self.points is None or len(self.points.feature) != self.deviation_mm.size:
+            raise ValueError(f"run {self.label}: a run of an artefact needs a feature for every reading")
         if self.tool_mm is not None and (self.tool_mm.shape != (3,) or not np.isfinite(self.tool_mm).all()):
             raise ValueError(f"run {self.label}: tool_mm must be three finite numbers")
         if self.u_length_mm is not None and not (np.isfinite(self.u_length_mm) and self.u_length_mm >= 0):

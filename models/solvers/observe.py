@@ -18,12 +18,14 @@ Published methods (Yang and Kim; Wang) take the set-ups as perfect. Here each se
   in the angles, so the angles themselves, with zero derivative at zero, cannot be the unknowns.
 - ``laser_scale``: relative error of the laser's wavelength, common to all laser runs of the campaign.
 - ``zero_<run>``, mm, and ``drift_<run>``, mm/s: error of a laser run's first record, which sets its zero; slow drift of the run.
+- those of an artefact: `abbe.models.solvers.artefact`.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import numpy as np
 
@@ -31,6 +33,8 @@ from abbe.models.arrays import F1, F2, F3, F4
 from abbe.models.geometry.bases import Term, layout_of, term_values
 from abbe.models.geometry.chain import exact_deviation_mm, exact_jacobian, motion_jacobian
 from abbe.models.machine import Machine, with_tool
+from abbe.models.solvers.artefact import ArtefactReading
+from abbe.models.solvers.artefact import unknowns as artefact_unknowns
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, bar_length_sd
 
@@ -51,7 +55,7 @@ BAR_DIGITS = 2
 
 @dataclass(frozen=True)
 class SetupUnknowns:
-    """Names and prior standard deviations of a campaign's set-up unknowns; ``start_s``: first reading of each ball-bar set-up."""
+    """Names and prior standard deviations of a campaign's set-up unknowns; ``start_s``: first reading of each set-up but the laser's."""
 
     names: tuple[str, ...]
     prior_sd: F1
@@ -75,11 +79,14 @@ def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine |
         Two runs of one set-up have different cups, beams, tools or instruments; a new mounting must be another set-up.
     """
     _check_setups(runs, None if machine is None else machine.tool_mm)
-    spans = _bar_spans(runs)
+    spans = _spans(runs)
     sd: dict[str, float] = {"laser_scale": priors.laser_scale} if any(r.kind == "laser" for r in runs) else {}
     for run in runs:
         if run.kind == "bar":
             sd |= _bar_unknowns(run, sd, priors, spans[run.setup])
+        elif run.points is not None:
+            first, last = spans[run.setup]
+            sd |= artefact_unknowns(run.points, run.setup, last - first)
         else:
             sd |= _laser_unknowns(run, priors)
     return SetupUnknowns(tuple(sd), np.array(list(sd.values())), {name: start for name, (start, _) in spans.items()})
@@ -105,11 +112,11 @@ def _laser_unknowns(run: RunData, priors: Priors) -> dict[str, float]:
     return out
 
 
-def _bar_spans(runs: tuple[RunData, ...]) -> dict[str, tuple[float, float]]:
-    """First and last reading of every ball-bar set-up, s."""
+def _spans(runs: tuple[RunData, ...]) -> dict[str, tuple[float, float]]:
+    """First and last reading of every set-up of a ball-bar or artefact, s."""
     spans: dict[str, tuple[float, float]] = {}
     for run in runs:
-        if run.kind == "bar":
+        if run.kind != "laser":
             first, last = spans.get(run.setup, (np.inf, -np.inf))
             spans[run.setup] = (min(first, float(run.t_s.min())), max(last, float(run.t_s.max())))
     return spans
@@ -317,7 +324,7 @@ class _SetupValues:
         return out
 
 
-def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> _Bar | _Laser:
+def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> _Bar | _Laser | ArtefactReading:
     n_machine = len(terms) + LOST
     if theta.shape != (n_machine + len(setup.names),):
         raise ValueError(f"run {run.label}: {theta.size} unknowns given, {n_machine + len(setup.names)} expected")
@@ -326,9 +333,17 @@ def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnk
     places = AxisPlaces.of(machine, terms, run.axes_mm, run.sign)
     if run.kind == "laser":
         return _Laser(run, places, known, places.motions(theta))
+    if run.points is not None:
+        motions, since = places.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0])
+        rows = partial(_rows, places, motions)
+        return ArtefactReading(run.points, run.setup, known, places.deviation_mm(motions), rows, since)
     assert run.centre_mm is not None
     cup = AxisPlaces.of(machine, terms, run.centre_mm[None], np.zeros((1, 3)))
     return _Bar(run, places, known, places.motions(theta), cup, cup.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0]))
+
+
+def _rows(places: AxisPlaces, motions: F3, direction: F2) -> F2:
+    return places.rows(direction, places.slope(motions))
 
 
 @dataclass(frozen=True)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import SMOOTH_ORDER, Term
 from abbe.models.machine import Machine
+from abbe.models.solvers.artefact import LEARNED
 
 U_WAVELENGTH = 0.3e-6
 """Relative standard uncertainty of the laser's wavelength after air compensation (about 0.3 K or 1 hPa)."""
@@ -110,7 +111,7 @@ SMOOTHNESS_SD = 0.7
 """Hyperprior of how much faster than documented the sizes of one motion fall with the order; never slower (`SizeModel.low`)."""
 ORDER_SD, LEAST_ORDER, LARGEST_ORDER = 1.0, -6.0, 1.0
 """Hyperprior and bounds of the log variance of one order, common to all motions: a little larger than documented, or almost nothing."""
-LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift")
+LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift", *LEARNED)
 """Set-up unknowns from mounting and temperature, whose typical size is estimated from the data; that of calibrations is not."""
 LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
 """Correlation lengths of the error motions that are tried, in strokes: 0.1 to 1.35."""

@@ -30,7 +30,7 @@ from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, b
 
 BAR_TRAVEL_MM = 1.0
 """Measuring range of a usual ball-bar to either side of its nominal length."""
-HAND_SET = ("cup", "tilt", "zero")
+HAND_SET = ("cup", "tilt", "zero", "pose", "turn", "form", "scale", "stylus", "lobing")
 """Set-up unknowns that no run states; together with uncalibrated bar lengths they are free in every rank analysis.
 All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). They are known for the
 rank and count in every uncertainty. Otherwise a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time,
@@ -59,6 +59,8 @@ def as_meant(run: RunData) -> RunData:
     """
     if run.kind == "bar":
         return replace(run, axes_mm=_resting(_on_the_sphere(run)))
+    if run.kind == "artefact":
+        return run
     line = straight_line_of(run.axes_mm)
     if line is None or run.beam is None or not line[1].any():
         return replace(run, axes_mm=_resting(run.axes_mm))
