@@ -9,6 +9,7 @@ from pydantic import BaseModel
 
 from abbe.drivers.device_file import DeviceFile
 from abbe.service.config_schema import MachineFile
+from abbe.service.domain.artefact import ArtefactRunFile
 from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.run_file import CampaignFile, ErrorsFile, RunFile
@@ -19,6 +20,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "device-file": DeviceFile,
     "machine": MachineObject,
     "run": RunFile,
+    "artefact-run": ArtefactRunFile,
     "campaign": CampaignFile,
     "errors": ErrorsFile,
     "solution": SolutionFile,

@@ -264,11 +264,11 @@ class ArtefactReading:
     def _length_jacobian(self) -> F2:
         p, (_, unit) = self.points, self._length()
         none = np.zeros_like(p.nominal_mm)
-        one = _place_slopes(p, self.known, p.feature, p.nominal_mm, -unit, none)
-        two = _place_slopes(p, self.known, p.far, p.far_mm, unit, none)
-        parts = {name: one.get(name, 0.0) + two.get(name, 0.0) * np.ones(len(unit)) for name in {*one, *two}}
-        ends = enumerate(zip(p.feature, p.far, strict=True))
-        parts |= {f"calibration_{p.artefact}_{a}_{b}": np.eye(len(unit))[i] for i, (a, b) in ends}
+        near = _place_slopes(p, self.known, p.feature, p.nominal_mm, -unit, none)
+        far = _place_slopes(p, self.known, p.far, p.far_mm, unit, none)
+        parts = {name: near.get(name, 0.0) + far.get(name, 0.0) * np.ones(len(unit)) for name in {*near, *far}}
+        ends = [f"calibration_{p.artefact}_{a}_{b}" for a, b in zip(p.feature, p.far, strict=True)]
+        parts |= {name: np.array([float(one == name) for one in ends]) for name in ends}
         return np.concatenate([0.0 * self.rows(none), self.known.columns(parts, len(unit))], axis=1)
 
 

@@ -17,6 +17,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import SMOOTH_ORDER, Term, smooth_terms
 from abbe.models.machine import AXES
+from abbe.models.solvers.components import KINDS
 from abbe.models.solvers.joint import JointSolution, kept
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import run_design
@@ -232,11 +233,12 @@ def _design(solution: JointSolution, above: tuple[Term, ...]) -> F2:
 SOURCE_TEXTS = {
     "bar_noise": "sensor noise of the ball-bar (and what a smooth model cannot follow)",
     "laser_noise": "sensor noise of the laser (and what a smooth model cannot follow)",
+    "artefact_noise": "repeatability of the probed points (and what a smooth model cannot follow)",
     "repeatability": "repeatability of the machine",
     "bar_length": "calibration of the bar's length",
     "bar_temperature": "temperature of the bar (assumed)",
     "wavelength": "calibration of the laser's wavelength (stated)",
-    "setup": "set-up: cup, mirror, zero and drift, where the data leave them open",
+    "setup": "set-up: cup, mirror, zero, drift, pose, form of the artefact, where the data leave them open",
     "scale_temperature": "temperature of the scales (assumed)",
     "model_order": "error motions of orders above the chosen one",
     "table": "a table in force of which nothing is known (assumed of usual size)",
@@ -245,7 +247,7 @@ SOURCE_TEXTS = {
 }
 """Text of every source of a budget."""
 
-FROM_READINGS = frozenset({"bar_noise", "laser_noise", "estimated_sizes"})
+FROM_READINGS = frozenset({"bar_noise", "laser_noise", "artefact_noise", "estimated_sizes"})
 """Sources whose size the campaign's own readings gave: type A evaluation (GUM 4.2)."""
 
 
@@ -379,7 +381,7 @@ def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
     share = np.minimum(inputs.repeatability_mm**2, variance)  # at most the readings' own variance
-    for kind in ("bar", "laser"):
+    for kind in KINDS:
         mask = r.kind == kind
         if mask.any():
             left = None if inputs.repeatability_mm == 0 else variance - share

@@ -250,6 +250,11 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
         raise CampaignRefused(f"run {bad[0].run}: {bad[0].what}{more}", f"{bad[0].remedy}; nothing was stored")
 
 
+def artefact_issues(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
+    """Return issues of runs of artefacts that need no model: machine, positions."""
+    return [issue for run in runs for issue in _other_machine(machine, run) or geometry_issues(machine, run)]
+
+
 def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
     """Return issues that need no model: machine, geometry, units, times, copies, too few readings.
 

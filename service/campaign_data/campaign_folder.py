@@ -85,7 +85,7 @@ def from_store(store: Store, name: str) -> Campaign:
 def _campaign(name: str, doc: dict[str, Any], runs: list[Run], folder: Path | None) -> Campaign:
     machine = doc["machine"]
     site = Site(str(machine.get("name") or name), machine_from_doc(machine), machine, DeviceUrls())
-    return Campaign(name, site, with_earliest_mounting(runs), folder, doc)
+    return Campaign(name, site, with_earliest_mounting([run.with_artefact(doc) for run in runs]), folder, doc)
 
 
 def store_solution(store: Store, campaign: Campaign, doc: dict[str, Any]) -> dict[str, Any]:

@@ -15,22 +15,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from abbe.models.arrays import F1
 from abbe.models.machine import Machine
 from abbe.service.domain.run import Run
 
 SETUP_OF_DATA = ("deviation_mm", "x_mm", "y_mm", "z_mm", "t_s", "valid")
+POINTS_OF_DATA = ("feature", "deviation_x_mm", "deviation_y_mm", "deviation_z_mm", "u_mm", "temperature_C", "touch_start_deg")
 
 
 def run_digest(run: Run) -> str:
     """Return the SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
     out = hashlib.sha256(json.dumps([run.test, run.setup.document], sort_keys=True).encode())
     columns = run.columns.by_name()
-    for name in SETUP_OF_DATA:
+    for name in SETUP_OF_DATA + (POINTS_OF_DATA if run.columns.of_artefact else ()):
         values = columns.get(name)
         out.update(name.encode())
-        out.update(b"-" if values is None else np.asarray(values, dtype="<f8").tobytes())
+        out.update(b"-" if values is None else _bytes(values))
     return out.hexdigest()
 
 
@@ -61,8 +63,13 @@ def whole_run_digest(run: Run) -> str:
         out.update(json.dumps([run.measured_digest, list(run.subtracted)]).encode())
     for name, values in sorted(run.columns.by_name().items()):
         if not (name == "deviation_mm" and run.measured_digest):
-            out.update(name.encode() + np.asarray(values, dtype="<f8").tobytes())
+            out.update(name.encode() + _bytes(values))
     return out.hexdigest()
+
+
+def _bytes(values: NDArray[Any]) -> bytes:
+    """Numbers as float64, names as text."""
+    return "\n".join(values.tolist()).encode() if values.dtype.kind == "U" else np.asarray(values, dtype="<f8").tobytes()
 
 
 def code_digest(function: Callable[..., Any]) -> str:

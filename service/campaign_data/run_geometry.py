@@ -38,7 +38,11 @@ def geometry_mistake(machine: Doc, run: Run) -> GeometryMistake | None:
     points, setup = run.columns.q_mm, run.setup
     if not np.isfinite(points).all():
         return GeometryMistake("a position is not a finite number", "correct x_mm, y_mm, z_mm")
-    found = _bar(run.test, setup, points) if isinstance(setup, BarSetup) else _laser(run.test, setup, points)
+    found = None
+    if isinstance(setup, BarSetup):
+        found = _bar(run.test, setup, points)
+    elif isinstance(setup, LaserSetup):
+        found = _laser(run.test, setup, points)
     return found or _inside(machine, points)
 
 

@@ -97,7 +97,7 @@ def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
 
 
 def _instruments(runs: list[Run]) -> set[str]:
-    return {"ballbar" if r.is_bar else "laser" for r in runs}
+    return {r.instrument for r in runs}
 
 
 def until_s(day: date) -> float:

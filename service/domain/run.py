@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
+from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run_file import RUN_FORMAT
 from abbe.service.errors import MeasurementFault, StoreError
@@ -19,6 +20,8 @@ SENSORS = ("x", "y", "z", "spindle", "air")
 """Temperature sensors with a column of their own, ``temp_x_C`` .. ``temp_air_C``."""
 PLACES = ("x_mm", "y_mm", "z_mm")
 PRESSURE = "pressure_air_Pa"
+FEATURE = "feature"
+"""Column that only a run of an artefact has; its readings are ``deviation_x_mm`` .. ``deviation_z_mm``."""
 _TYPED = frozenset(("t_s", *PLACES, "feed_mm_min", "direction", "deviation_mm", "valid"))
 
 
@@ -46,9 +49,9 @@ class Columns:
         return cls(
             t_s=t_s,
             q_mm=np.column_stack([_floats(doc[name]) for name in PLACES]),
-            feed_mm_min=_floats(doc["feed_mm_min"]),
-            direction=_floats(doc["direction"]),
-            deviation_mm=None if doc["deviation_mm"] is None else _floats(doc["deviation_mm"]),
+            feed_mm_min=np.full(t_s.size, np.nan) if FEATURE in doc else _floats(doc["feed_mm_min"]),
+            direction=np.ones(t_s.size) if FEATURE in doc else _floats(doc["direction"]),
+            deviation_mm=None if FEATURE in doc or doc["deviation_mm"] is None else _floats(doc["deviation_mm"]),
             valid=np.ones(t_s.size, dtype=np.bool_) if valid is None else np.asarray(valid).astype(np.bool_),
             valid_stated=valid is not None,
             further={name: _numbers(values) for name, values in doc.items() if name not in _TYPED and values is not None},
@@ -73,6 +76,11 @@ class Columns:
     def __len__(self) -> int:
         """Number of rows."""
         return int(self.t_s.size)
+
+    @property
+    def of_artefact(self) -> bool:
+        """Whether these are points of an artefact."""
+        return FEATURE in self.further
 
     @property
     def readings_mm(self) -> F1:
@@ -100,7 +108,8 @@ class Columns:
     def by_name(self) -> dict[str, NDArray[Any]]:
         """All columns by their names in the format, without those that are sealed or missing."""
         places = {name: self.q_mm[:, k] for k, name in enumerate(PLACES)}
-        out: dict[str, NDArray[Any]] = {"t_s": self.t_s, **places, "feed_mm_min": self.feed_mm_min, "direction": self.direction}
+        out: dict[str, NDArray[Any]] = {"t_s": self.t_s, **places}
+        out |= {} if self.of_artefact else {"feed_mm_min": self.feed_mm_min, "direction": self.direction}
         out |= {} if self.deviation_mm is None else {"deviation_mm": self.deviation_mm}
         before = {name: v for name, v in self.further.items() if name.startswith("temp_") or name == PRESSURE}
         out |= before | ({"valid": self.valid} if self.valid_stated else {})
@@ -122,10 +131,12 @@ class Columns:
     def equals(self, other: Columns) -> bool:
         """Whether both have the same columns with the same numbers."""
         mine, theirs = self.by_name(), other.by_name()
-        return mine.keys() == theirs.keys() and all(np.array_equal(values, theirs[name], equal_nan=True) for name, values in mine.items())
+        return mine.keys() == theirs.keys() and all(_same(values, theirs[name]) for name, values in mine.items())
 
     def to_document(self) -> Doc:
         """Plain lists of Python numbers by column; ``deviation_mm`` is null for a sealed run."""
+        if self.of_artefact:
+            return {name: [None if v != v else v for v in values.tolist()] for name, values in self.by_name().items()}
         out: Doc = {name: values.tolist() for name, values in self.by_name().items()}
         out |= {"direction": self.direction.astype(np.int64).tolist()}
         out |= {"valid": self.valid.astype(np.int64).tolist()} if self.valid_stated else {}
@@ -137,9 +148,13 @@ def _floats(values: Any) -> F1:
 
 
 def _numbers(values: Any) -> NDArray[Any]:
-    """A column with its type: integers stay integers."""
+    """A column with its type: integers stay integers, text stays text."""
     found = np.asarray(values)
-    return found if found.dtype.kind in "iu" else _floats(values)
+    return found if found.dtype.kind in "iuU" else _floats(values)
+
+
+def _same(one: NDArray[Any], two: NDArray[Any]) -> bool:
+    return np.array_equal(one, two, equal_nan=one.dtype.kind == "f" == two.dtype.kind)
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -247,8 +262,38 @@ class LaserSetup(Setup):
         return end - start
 
 
-def parsed_setup(test: str, doc: Doc) -> BarSetup | LaserSetup:
+@dataclass(frozen=True, kw_only=True, eq=False)
+class ArtefactSetup(Setup):
+    """Where an artefact lay.
+
+    ``by_machine``: found by the machine's probe, else made by the machine and found by a CMM; ``matrix``: columns are the artefact's axes
+    in machine axes, shape (3, 3). ``features``, ``cmm``: as the campaign states them (`Run.with_artefact`).
+    """
+
+    artefact: str
+    by_machine: bool
+    origin_mm: F1
+    matrix: F2
+    features: ArtefactObject | None = None
+    cmm: Doc = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_document(cls, doc: Doc) -> Self:
+        """Parse ``setup`` of a run of an artefact."""
+        pose, source = doc["pose"], str(doc["source"])
+        return cls(
+            **_common(doc),
+            artefact=str(doc["artefact"]),
+            by_machine=source == "machine-probe",
+            origin_mm=_floats(pose["origin_mm"]),
+            matrix=_floats(pose["matrix"]),
+        )
+
+
+def parsed_setup(test: str, doc: Doc) -> BarSetup | LaserSetup | ArtefactSetup:
     """Parse ``setup`` of a run of this test."""
+    if test == ARTEFACT_TEST:
+        return ArtefactSetup.from_document(doc)
     return BarSetup.from_document(doc) if test.startswith("ballbar") else LaserSetup.from_document(doc)
 
 
@@ -354,7 +399,7 @@ class Run:
     test: str
     role: str
     machine: Doc = field(repr=False)
-    setup: BarSetup | LaserSetup
+    setup: BarSetup | LaserSetup | ArtefactSetup
     columns: Columns = field(repr=False)
     table: RunTable = RunTable()
     timing: RunTiming = RunTiming()
@@ -406,9 +451,19 @@ class Run:
         return isinstance(self.setup, BarSetup)
 
     @property
+    def is_artefact(self) -> bool:
+        """Whether these are points of an artefact."""
+        return isinstance(self.setup, ArtefactSetup)
+
+    @property
+    def instrument(self) -> str:
+        """``ballbar``, ``laser`` or ``artefact``."""
+        return "ballbar" if self.is_bar else "artefact" if self.is_artefact else "laser"
+
+    @property
     def is_sealed(self) -> bool:
         """Whether its readings are withheld."""
-        return self.columns.deviation_mm is None
+        return self.columns.deviation_mm is None and not self.columns.of_artefact
 
     @property
     def identifies(self) -> bool:
@@ -422,7 +477,7 @@ class Run:
         Raises
         ------
         MeasurementFault
-            It is a laser run.
+            It is a run of a laser or an artefact.
         """
         if not isinstance(self.setup, BarSetup):
             raise MeasurementFault(f"run {self.run_id} was not measured with a ball-bar", "leave it out")
@@ -435,7 +490,7 @@ class Run:
         Raises
         ------
         MeasurementFault
-            It is a ball-bar run.
+            It is a run of a ball-bar or an artefact.
         """
         if not isinstance(self.setup, LaserSetup):
             raise MeasurementFault(f"run {self.run_id} was not measured with a laser", "leave it out")
@@ -459,6 +514,27 @@ class Run:
             why = f"run {self.run_id}: a laser run needs nominal_beam, or a start_mm that differs from end_mm"
             raise MeasurementFault(why, "correct the run or leave it out")
         return np.asarray(beam / length)
+
+    def with_artefact(self, campaign: Doc) -> Run:
+        """The run with its artefact and CMM as the campaign's document states them; another run stays as it is.
+
+        Raises
+        ------
+        MeasurementFault
+            The campaign has no such artefact, or the artefact lacks a feature of the run.
+        """
+        setup = self.setup
+        if not isinstance(setup, ArtefactSetup):
+            return self
+        found = (campaign.get("artefacts") or {}).get(setup.artefact)
+        if found is None:
+            raise MeasurementFault(f"run {self.run_id}: the campaign has no artefact {setup.artefact!r}", "add it under the key artefacts")
+        features = ArtefactObject.read(found)
+        strange = set(self.columns.further[FEATURE].tolist()) - {f.id for f in features.features}
+        if strange:
+            why = f"run {self.run_id}: artefact {setup.artefact} has no feature {min(strange)!r}"
+            raise MeasurementFault(why, "correct the column feature or the artefact's list")
+        return replace(self, setup=replace(setup, features=features, cmm=(campaign.get("instruments") or {}).get("cmm") or {}))
 
     def with_readings(self, deviation_mm: F1) -> Run:
         """The run with other readings, mm, shape (n,)."""

@@ -6,6 +6,7 @@ from typing import Annotated, Literal, Self
 
 from pydantic import ConfigDict, Field, model_validator
 
+from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.domain.imported_file import Origin, OtherReadings, StatedFigure
 from abbe.service.domain.machine import FileObject, Interval, MachineObject, Point
 
@@ -121,7 +122,7 @@ class RunEntry(FileObject):
     """One run of the campaign and its file."""
 
     run_id: Name
-    test: Test
+    test: Test | Literal["artefact_points"]
     role: Role
     file: FileName
 
@@ -137,6 +138,7 @@ class CampaignFile(FileObject):
     setups: dict[str, CampaignSetup]
     temperature_sensors: bool
     runs: list[RunEntry]
+    artefacts: dict[str, ArtefactObject] = Field(default_factory=dict)
     origins: list[Origin] = Field(default_factory=list)
     readings: list[OtherReadings] = Field(default_factory=list)
     stated: list[StatedFigure] = Field(default_factory=list)

@@ -96,7 +96,7 @@ def subtract_effects(campaign: Campaign, entries: Sequence[EffectSize], origin: 
     case = case_of(campaign.doc, campaign.site.machine, campaign.runs)
     known_mm = readings_of(entries, effects or catalogue(), case)
     removed = f"{origin}: {', '.join(e.label for e in entries)}"
-    return replace(campaign, runs=[_subtracted(run, known_mm[run.run_id], removed) for run in campaign.runs])
+    return replace(campaign, runs=[run if run.is_artefact else _subtracted(run, known_mm[run.run_id], removed) for run in campaign.runs])
 
 
 def _subtracted(run: Run, known_mm: F1, removed: str) -> Run:

@@ -19,10 +19,11 @@ from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
 from abbe.models.solvers.step_diagonal import ORDER, closure_mm, increments, squareness_contrast, u_wang_four, wang_four
 from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.service.campaign_data.campaign_checks import CampaignIssue, check_files, check_readings, copy_issues, refuse
+from abbe.service.campaign_data.campaign_checks import CampaignIssue, artefact_issues, check_files, check_readings, copy_issues, refuse
 from abbe.service.campaign_data.provenance import measured_digest, removals_of
 from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
+from abbe.service.runs.artefact_points import calibrated_lengths
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
 from abbe.service.verification.iso_report import laser_inputs
@@ -115,11 +116,12 @@ def solve_runs(
     data = tuple(run_data(r) for r in used)
     inputs = laser_inputs(instruments or {})
     priors = replace(Priors(), laser_scale=inputs.u_wavelength)
-    joint = solve_joint(site.machine, data, model=model, priors=priors, progress=progress)
+    lengths = calibrated_lengths(used)
+    joint = solve_joint(site.machine, (*data, *lengths), model=model, priors=priors, progress=progress)
     if beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else ""):
         flags.append(beyond)
-        joint = solve_joint(site.machine, data, model="rigid6", priors=priors, progress=progress) if free else joint
-    flags += check_instruments(joint, data)
+        joint = solve_joint(site.machine, (*data, *lengths), model="rigid6", priors=priors, progress=progress) if free else joint
+    flags += check_instruments(joint, (*data, *lengths))
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     digests = {r.run_id: measured_digest(r) for r in used}
@@ -157,13 +159,14 @@ def check_campaign(site: Site, used: list[Run], others: list[Run], model: Model)
     CampaignRefused
         A run is wrong; the message names the run, the mistake and the remedy.
     """
-    flags = check_files(site.doc, used)
+    plain = [r for r in used if not r.is_artefact]
+    flags = check_files(site.doc, plain) + artefact_issues(site.doc, [r for r in used if r.is_artefact])
     known = {f.run for f in flags}
-    flags += [f for f in copy_issues([*used, *others]) if f.run not in known]
+    flags += [f for f in copy_issues([*plain, *(r for r in others if not r.is_artefact)]) if f.run not in known]
     refuse(flags)
     data = [run_data(r, blocks=ALL_READINGS) for r in used]
     check_enough(data, model)
-    flags += check_readings(site.machine, data)
+    flags += check_readings(site.machine, [r for r in data if r.kind != "artefact"])
     refuse(flags)
     return flags
 
@@ -187,7 +190,7 @@ def check_enough(data: list[RunData], model: Model) -> None:
 
 
 def _unknowns(data: list[RunData], model: Model) -> int:
-    return (TWENTY_ONE if model == "rigid21" else SIX) + sum(4 if r.kind == "bar" else 2 for r in data)
+    return (TWENTY_ONE if model == "rigid21" else SIX) + sum({"bar": 4, "laser": 2, "artefact": 3}[r.kind] for r in data)
 
 
 def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:

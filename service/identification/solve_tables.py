@@ -15,6 +15,7 @@ from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, vali
 from abbe.models.uncertainty.prediction import worst_point
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
+from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts
 from abbe.service.identification.solve_report import Assessment, point, solution_verdict
 
 ProgressText = Callable[[str], None]
@@ -68,12 +69,19 @@ def grid_text(table: GridTable) -> str:
 def deviation_text(found: Assessment, points_mm: F2) -> str:
     """Return the deviation at points, shape (n, 3), as CSV with a line for each point, and the verdict of the solution as a last comment.
 
-    ``dx_um`` to ``dz_um``: tool relative to workpiece, best-fit rigid motion over the strokes removed; ``U_``: expanded uncertainty, 95 %.
+    ``dx_um`` to ``dz_um``: tool relative to workpiece, best-fit rigid motion over the strokes removed (of artefacts: as a comment says, and
+    empty in a direction that was not sensed); ``U_``: expanded uncertainty, 95 %.
     """
-    p = found.predict(points_mm)
-    rows = zip(p.points_mm, np.column_stack([p.deviation_mm, p.expanded_mm]) * 1e3, strict=True)
-    lines = [",".join([*(f"{v:.10g}" for v in at), *(f"{v:.6g}" for v in values)]) for at, values in rows]
-    return "\n".join([DEVIATION_HEADER, *lines, f"# verdict: {solution_verdict(found).word}"]) + "\n"
+    notes = [f"# verdict: {solution_verdict(found).word}"]
+    if only_artefacts(found.joint):
+        deviation, expanded, frame = deviation_of_artefacts(found.joint, points_mm)
+        notes = [f"# frame: {frame}", *notes]
+    else:
+        p = found.predict(points_mm)
+        deviation, expanded = p.deviation_mm, p.expanded_mm
+    rows = zip(points_mm, np.column_stack([deviation, expanded]) * 1e3, strict=True)
+    lines = [",".join([*(f"{v:.10g}" for v in at), *("" if np.isnan(v) else f"{v:.6g}" for v in values)]) for at, values in rows]
+    return "\n".join([DEVIATION_HEADER, *lines, *notes]) + "\n"
 
 
 def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:

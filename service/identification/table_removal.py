@@ -116,19 +116,19 @@ def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:
 
 
 def subtract_table(runs: list[Run], out: RemovedTable) -> list[Run]:
-    """Subtract a table's effect from runs; a run without readings stays unchanged."""
+    """Subtract a table's effect from runs; one of an artefact or without readings stays unchanged."""
     return [_subtracted(run, out) for run in runs]
 
 
 def _lost_motion(site: Site, used: list[Run], table: NineTables) -> dict[str, tuple[float, float]]:
     """Solve lost motion and its u by axis, mm, after subtracting the whole table, whose interpolation would look like reversals."""
-    plain = [r for r in used if r.is_bar or not r.laser.order]
+    plain = [r for r in used if r.is_bar or r.is_artefact or not r.laser.order]
     runs = subtract_table(plain or used, RemovedTable(AppliedTables(table.correction_at), NOTHING))
     return solve_joint(site.machine, tuple(run_data(r) for r in runs)).backlash_mm()
 
 
 def _subtracted(run: Run, out: RemovedTable) -> Run:
-    if run.is_sealed:
+    if run.is_sealed or run.is_artefact:
         return run
     axes, reading = run.columns.q_mm, run.columns.readings_mm.copy()
     known = np.isfinite(axes).all(axis=1)

@@ -130,7 +130,7 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
 
 def _verification(runs: Sequence[Run], rules: Rules) -> tuple[list[ReportFigure], Verdict | None]:
     """Figures of a verification and their verdict, if these runs contain all four body diagonals, measured once out and back."""
-    known = [r for r in runs if not r.is_sealed and (r.is_bar or r.laser.cycles == 1) and not not_judged(r)]
+    known = [r for r in runs if not r.is_sealed and not r.is_artefact and (r.is_bar or r.laser.cycles == 1) and not not_judged(r)]
     body = {r.laser.diagonal for r in known if r.test == "laser_diagonal" and not r.laser.order}
     if not body >= DIAGONALS:
         return [], None

@@ -65,7 +65,7 @@ def machine_facts(machine: Doc) -> dict[str, str]:
 
 def instruments(runs: Sequence[Run], campaign: Doc, rules: Rules) -> list[Instrument]:
     """Instruments used in these runs."""
-    kinds = {"ballbar" if r.is_bar else "laser" for r in runs}
+    kinds = {r.instrument for r in runs}
     return [Instrument(NAMES[k], _certificate(k, rules), _known(k, runs, campaign)) for k in NAMES if k in kinds]
 
 

@@ -12,7 +12,7 @@ from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, at_rest, driven, since_reversal
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
-from abbe.service.domain.run import LaserSetup, Run
+from abbe.service.domain.run import BarSetup, LaserSetup, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, Role
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import with_reversals
@@ -26,7 +26,7 @@ CLOCKS_S = 60.0
 
 
 def case_of(campaign: dict[str, Any], machine: Machine, runs: list[Run]) -> Case:
-    """Turn an ``abbe-campaign/1`` object and its runs into a case.
+    """Turn an ``abbe-campaign/1`` object and its runs into a case; points of artefacts are no part of it.
 
     Raises
     ------
@@ -41,7 +41,7 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[Run]) -> Case
         "laser": float((instruments.get("laser") or {}).get("resolution_mm") or RESOLUTION_MM["laser"]),
     }
     includes = (campaign.get("current_model") or {}).get("includes", ASSUMED_MODEL)
-    found = tuple(_run(run, machine, vertical, dead) for run in with_earliest_mounting(runs))
+    found = tuple(_run(run, machine, vertical, dead) for run in with_earliest_mounting(runs) if not run.is_artefact)
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
 
 
@@ -62,7 +62,7 @@ def with_earliest_mounting(runs: list[Run]) -> list[Run]:
 def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> CaseRun:
     path, columns, setup = path_of(run, machine, vertical, dead_path_mm), run.columns, run.setup
     found = CaseRun(path, cast(Role, run.role), columns.deviation_mm, columns.valid)
-    if isinstance(setup, LaserSetup):
+    if not isinstance(setup, BarSetup):
         return found
     return replace(found, u_length_mm=setup.u_length_mm, length_calibrated=setup.length_calibrated)
 
@@ -96,10 +96,10 @@ def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> P
         look = np.broadcast_to(run.beam, q.shape)
         along: dict[str, Any] = {"reference": _first(at), "look": look, "travel_mm": (q - q[0]) @ run.beam, "dead_path_mm": dead_path_mm}
         return Path(**common, **along, at=at, kind="laser", radius_mm=0.0, centre_mm=np.zeros(3))
-    centre = setup.centre_mm
+    centre = run.bar.centre_mm
     cup: dict[str, Any] = {"reference": at_rest(centre, t_set, first), "look": _away(q, centre, run.run_id)}
     return Path(
-        **common, **cup, at=at, kind="bar", travel_mm=np.zeros(len(q)), dead_path_mm=0.0, radius_mm=setup.radius_mm, centre_mm=centre
+        **common, **cup, at=at, kind="bar", travel_mm=np.zeros(len(q)), dead_path_mm=0.0, radius_mm=run.bar.radius_mm, centre_mm=centre
     )
 
 

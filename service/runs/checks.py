@@ -10,6 +10,7 @@ from typing import Any, NoReturn, TypeVar
 
 from pydantic import BaseModel, ValidationError
 
+from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactRunFile, ArtefactSetupObject, PointColumns
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run_file import ColumnsObject, RunFile, SetupObject
 from abbe.service.errors import FileFormatError, expected, location_text, short_repr
@@ -128,7 +129,7 @@ def check(path: Path, document: Doc, model: type[Parsed]) -> Parsed:
     return found
 
 
-def check_run(path: Path, document: Doc) -> RunFile:
+def check_run(path: Path, document: Doc) -> RunFile | ArtefactRunFile:
     """Parse a run file after checking its columns row by row; ``path`` is named in errors.
 
     Raises
@@ -136,11 +137,13 @@ def check_run(path: Path, document: Doc) -> RunFile:
     FileFormatError
         The document has a mistake; the first one is reported.
     """
-    for part, model in (("setup", SetupObject), ("columns", ColumnsObject)):
+    points = document.get("test") == ARTEFACT_TEST
+    models: tuple[type[BaseModel], ...] = (ArtefactSetupObject, PointColumns) if points else (SetupObject, ColumnsObject)
+    for part, model in zip(("setup", "columns"), models, strict=True):
         keys = document.get(part)
         for key in keys if isinstance(keys, dict) else ():
             _check_unit(path, f"{part}.{key}", key, model, units_needed=part == "columns")
-    found = check(path, document, RunFile)
+    found: RunFile | ArtefactRunFile = check(path, document, ArtefactRunFile) if points else check(path, document, RunFile)
     columns = {key: values for key, values in document["columns"].items() if values is not None}
     length = len(columns["t_s"])
     for key, values in columns.items():

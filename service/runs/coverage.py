@@ -157,8 +157,8 @@ def _of_setup(run: Run) -> float | None:
     try:
         if isinstance(setup, BarSetup):
             return _turned(setup, at - setup.centre_mm, circle=run.test == "ballbar_circle")
-        along = at @ setup.span_mm
-        whole = float(setup.span_mm @ setup.span_mm)
+        span = run.laser.span_mm
+        along, whole = at @ span, float(span @ span)
         return _share(_read(np.sort(along), GAP_SHARE * whole), whole)
     except (AbbeError, ValueError):
         return None

@@ -13,8 +13,9 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import REST_MM, travel_sign
 from abbe.models.solvers.observations import RunData, Test, block_average, reading_noise_mm
-from abbe.service.domain.run import LaserSetup, Run
+from abbe.service.domain.run import ArtefactSetup, LaserSetup, Run
 from abbe.service.errors import MeasurementFault
+from abbe.service.runs.artefact_points import artefact_data
 
 BEYOND_MM = 5.0
 """Assumed overrun beyond a place: more than any lost motion."""
@@ -103,6 +104,8 @@ def run_data(run: Run, *, blocks: int = BLOCKS) -> RunData:
 
 def _run_data(run: Run, blocks: int) -> RunData:
     columns, setup, label = run.columns, run.setup, run.run_id
+    if isinstance(setup, ArtefactSetup):
+        return artefact_data(run, setup)
     if run.test not in TESTS:
         raise MeasurementFault(f"run {label}: the solver does not know the test {run.test!r}", "leave it out")
     if run.is_sealed:

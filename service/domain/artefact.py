@@ -1,0 +1,126 @@
+"""Artefacts and runs of their points in the exchange formats; also the source of docs/schemas/artefact-run.schema.json."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal, Self
+
+from pydantic import AfterValidator, Field, model_validator
+
+from abbe.service.domain.machine import FileObject, MachineObject, Point
+
+ARTEFACT_TEST = "artefact_points"
+SQUARE = 1e-6
+"""A stated matrix is a rotation to this accuracy (components)."""
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+
+
+def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, Point]:
+    a, b, c = matrix
+    for i, one in enumerate(matrix):
+        for k, two in enumerate(matrix):
+            if abs(sum(p * q for p, q in zip(one, two, strict=True)) - (i == k)) > SQUARE:
+                raise ValueError("expected a rotation: rows of length 1, perpendicular to each other")
+    cross = (b[1] * c[2] - b[2] * c[1], b[2] * c[0] - b[0] * c[2], b[0] * c[1] - b[1] * c[0])
+    if sum(p * q for p, q in zip(a, cross, strict=True)) < 0.0:
+        raise ValueError("expected a rotation, got a reflection: exchange two rows or change a sign")
+    return matrix
+
+
+class Pose(FileObject):
+    """Stated pose of an artefact: axis position = origin + matrix times nominal place."""
+
+    origin_mm: Point
+    matrix: Annotated[tuple[Point, Point, Point], AfterValidator(_check_rotation)]
+
+
+class Feature(FileObject):
+    """One hole, ball or wall: nominal place, sensed axes of the artefact, and for a wall its outward normal."""
+
+    id: Name
+    nominal_mm: Point
+    sensed: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = "xyz"
+    normal: Point | None = None
+
+
+class CalibratedLength(FileObject):
+    """Distance of two features from a certificate, with expanded uncertainty U = k u."""
+
+    from_: str = Field(alias="from")
+    to: str
+    length_mm: float = Field(gt=0.0)
+    U_mm: float = Field(ge=0.0)
+    k: float = Field(2.0, gt=0.0)
+    temperature_C: float = 20.0  # noqa: N815
+
+
+class ArtefactObject(FileObject):
+    """A plate, bar or workpiece with its features and what is known of it."""
+
+    kind: str
+    features: list[Feature]
+    expansion_per_K: float = 11.5e-6  # noqa: N815
+    u_expansion_per_K: float = 1e-6  # noqa: N815
+    reference_temperature_C: float = 20.0  # noqa: N815
+    calibrated_lengths: list[CalibratedLength] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _known(self) -> Self:
+        names = [f.id for f in self.features]
+        twice = next((n for n in names if names.count(n) > 1), None)
+        if twice is not None:
+            raise ValueError(f"features: id {twice!r} appears twice, expected different ones")
+        for one in self.calibrated_lengths:
+            for end in (one.from_, one.to):
+                if end not in names:
+                    raise ValueError(f"calibrated_lengths: no feature has the id {end!r}")
+        return self
+
+
+class ArtefactSetupObject(FileObject):
+    """Where the artefact lay, and what found its points."""
+
+    setup_id: str
+    t_set_s: float
+    artefact: Name
+    source: Literal["machine-probe", "workpiece-on-cmm"]
+    tool_mm: Point
+    pose: Pose
+    tool_radius_mm: float | None = Field(None, gt=0.0)
+
+
+Numbers = list[float]
+Sensed = list[float | None]
+Signs = list[Literal[-1, 0, 1]]
+
+
+class PointColumns(FileObject):
+    """Points, one list per column, all of the same length; a direction that was not sensed is null."""
+
+    t_s: Numbers
+    x_mm: Numbers
+    y_mm: Numbers
+    z_mm: Numbers
+    feature: list[Name]
+    deviation_x_mm: Sensed
+    deviation_y_mm: Sensed
+    deviation_z_mm: Sensed
+    u_mm: list[Annotated[float, Field(gt=0.0)]]
+    temperature_C: Sensed | None = None  # noqa: N815
+    touch_start_deg: Sensed | None = None
+    from_x: Numbers | None = None
+    from_y: Numbers | None = None
+    from_z: Numbers | None = None
+    valid: list[Literal[0, 1]] | None = None
+
+
+class ArtefactRunFile(FileObject):
+    """One run of an artefact's points (``abbe-run/1``, test ``artefact_points``)."""
+
+    format: Literal["abbe-run/1"]
+    campaign: Name
+    run_id: Name
+    test: Literal["artefact_points"]
+    role: Literal["identify", "holdout", "sealed"]
+    machine: MachineObject
+    setup: ArtefactSetupObject
+    columns: PointColumns

@@ -1,0 +1,61 @@
+"""Deviation at points from a campaign of artefacts, in the frame that it can know."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import design
+from abbe.models.machine import with_tool
+from abbe.models.solvers.joint import JointSolution
+
+SENSED = 1e-3
+"""An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
+COVERAGE = 2.0
+MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
+NO_LENGTH = "; no length is calibrated: the scale is not observable"
+NOT_SENSED = "; the third direction was not sensed"
+
+
+def only_artefacts(joint: JointSolution) -> bool:
+    """Whether all readings of a solution are points of artefacts."""
+    return all(run.kind == "artefact" for run in joint.data)
+
+
+def without_length(joint: JointSolution) -> bool:
+    """Whether nothing tells the scale: probed artefacts only, none with a calibrated length."""
+    return all(run.points is not None and run.points.source == "probe" for run in joint.data)
+
+
+def unsensed_axis(joint: JointSolution) -> int | None:
+    """Return the machine axis along which no point was sensed; None if all were."""
+    runs = [run for run in joint.data if run.points is not None and run.points.source != "length"]
+    along = [np.abs(run.points.matrix.T[run.points.component]).max(axis=0) for run in runs if run.points is not None]
+    hidden = np.flatnonzero(np.max(along, axis=0) < SENSED)
+    return int(hidden[0]) if hidden.size else None
+
+
+def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2, str]:
+    """Return deviation and expanded uncertainty (k = 2) at points, mm, shape (n, 3) each, NaN where not sensed, and the frame in words."""
+    tool = next(run.tool_mm for run in joint.data if run.points is not None and run.points.source != "length")
+    at = design(with_tool(joint.machine, tool), joint.terms, points_mm)
+    axis, free = unsensed_axis(joint), without_length(joint)
+    keep = [k for k in range(3) if k != axis]
+    rows = at[:, keep].reshape(-1, len(joint.terms))
+    basis, _ = np.linalg.qr(_frame(points_mm, keep, scale=free))
+    rows = rows - basis @ (basis.T @ rows)
+    u: F1 = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, joint.term_covariance, rows), 0.0))
+    deviation, expanded = np.full((2, len(points_mm), 3), np.nan)
+    deviation[:, keep] = (rows @ joint.coefficients).reshape(-1, len(keep))
+    expanded[:, keep] = COVERAGE * u.reshape(-1, len(keep))
+    plane, scale = (" in the plane", NOT_SENSED) if axis is not None else ("", ""), (" and common scale", NO_LENGTH) if free else ("", "")
+    return deviation, expanded, MOTION.format(plane=plane[0], scale=scale[0]) + scale[1] + plane[1]
+
+
+def _frame(points_mm: F2, keep: list[int], *, scale: bool) -> F2:
+    """Rigid motions in the kept directions (and a common scale) at points, shape (n * kept, motions)."""
+    away, unit = points_mm - points_mm.mean(axis=0), np.eye(3)
+    turns = [k for k in range(3) if len(keep) == 3 or k not in keep]
+    columns = [np.tile(unit[k], (len(away), 1)) for k in keep] + [np.cross(unit[k], away) for k in turns]
+    columns += [away] if scale else []
+    return np.stack(columns, axis=-1)[:, keep].reshape(-1, len(columns))
