@@ -28,7 +28,7 @@ from abbe.service.files import NotPlainError, read_plain
 from abbe.service.formats.controls import CONTROLS, ControlModel, FormatChoice, best_of, choices, rounded
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.identified import Identified
-from abbe.service.formats.model import Compensation
+from abbe.service.formats.model import Compensation, negated
 from abbe.service.formats.registry import FORMATS, format_of
 from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.rendering.page_file import write_page
@@ -107,7 +107,7 @@ def control_for(key: str) -> ControlModel:
         raise FormatRefused(f"there is no format or control {key!r}", f"formats: {', '.join(FORMATS)}; controls: {', '.join(CONTROLS)}")
     form = FORMATS[key]
     for c in CONTROLS.values():
-        if key in (c.own, c.lattice, c.motions) and c.cross in ("", key):
+        if key in (c.own, c.lattice, c.motions, c.lines) and c.cross in ("", key):
             return replace(c, own=key if c.own == key else "", lattice=key if c.lattice == key else "")
     points = min(form.limits.points, 101)
     shared = key if form.limits.cross else ""
@@ -137,7 +137,36 @@ def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> F
     )
 
 
-def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh: bool = False, holds_at: str = UNKNOWN) -> Exported:
+STEP_UM, STEP_SHARE = 10.0, 0.2
+
+
+def sign_is_turned(step_moved_um: float | None) -> bool | None:
+    """Return what the 10 µm step proved: the sign is as we write it (False), or turned (True); None if it was not measured.
+
+    Raises
+    ------
+    FormatRefused
+        The axis moved by neither -10 nor +10 µm (within 20 %): axis, unit or scale are wrong.
+    """
+    if step_moved_um is None:
+        return None
+    if not abs(abs(step_moved_um) - STEP_UM) <= STEP_SHARE * STEP_UM:
+        raise FormatRefused(
+            f"the step moved the axis by {step_moved_um:g} µm, neither -10 nor +10: axis, unit or scale are not as we write them",
+            "load no table; compare the file with one that the control exports",
+        )
+    return step_moved_um > 0.0
+
+
+def export(
+    known: Identified,
+    key: str,
+    reference_mm: F1 | None = None,
+    *,
+    fresh: bool = False,
+    holds_at: str = UNKNOWN,
+    turned: bool | None = None,
+) -> Exported:
     """Return the best tables that a control (or a format alone) can hold, as the text of its files.
 
     Parameters
@@ -150,6 +179,8 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
         No correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
     holds_at : str
         Temperature of the scales at which the solution holds.
+    turned : bool, optional
+        What the 10 µm step proved (`sign_is_turned`); acts on formats whose sign no manual states.
 
     Raises
     ------
@@ -160,14 +191,17 @@ def export(known: Identified, key: str, reference_mm: F1 | None = None, *, fresh
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     found = choices(known, control, reference)
     best = best_of(found)
-    if best.numbers == 0:
+    if best.rms_mm >= found[0].rms_mm:
         raise FormatRefused(f"no kind of table of {control.name} reduces the errors", "the machine needs none; nothing was written")
-    files = files_of(best.compensation, control, settings_for(control, known.machine, reference))
-    return Exported(files, found, (f"holds at: {holds_at}", *_notes(best.compensation, control, fresh=fresh)))
+    files = files_of(best.compensation, control, settings_for(control, known.machine, reference), turned=turned or False)
+    return Exported(files, found, (f"holds at: {holds_at}", *_notes(best.compensation, control, fresh=fresh, turned=turned)))
 
 
-def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Write each part of a compensation (own, cross, lattice, motions) in the format that the control uses for it."""
+def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings, *, turned: bool = False) -> tuple[TextFile, ...]:
+    """Write each part of a compensation (own, cross, lattice, motions) in the format that the control uses for it.
+
+    ``turned``: the 10 µm step moved the wrong way; formats whose sign no manual states are written with the other sign.
+    """
     own = Compensation(comp.own)
     cross = Compensation(comp.cross, comp.products)
     if control.own == control.cross:
@@ -177,24 +211,30 @@ def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings
         (control.cross, cross),
         (control.lattice, Compensation(lattice=comp.lattice)),
         (control.motions, Compensation(motions=comp.motions)),
+        (control.lines, replace(comp, lost_motion_mm=comp.lost_motion_mm if holds_lost_motion(control) else {})),
     )
     out: list[TextFile] = []
     for key, part in parts:
-        if key and part.numbers:
-            out += format_of(key).write(part, settings)
+        if key and (part.numbers or any(part.lost_motion_mm.values())):
+            form = format_of(key)
+            out += form.write(negated(part) if turned and not form.sign.sure else part, settings)
     return tuple(out)
 
 
-def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[str, ...]:
+def _notes(comp: Compensation, control: ControlModel, *, fresh: bool, turned: bool | None) -> tuple[str, ...]:
     out = [] if fresh else [ONLY_FRESH]
     lost = {a: v for a, v in comp.lost_motion_mm.items() if abs(v) > 0.5e-3 * 1e-3}
-    if lost:
+    if lost and not holds_lost_motion(control):
         values = ", ".join(f"{a} {v * 1e3:.2f} µm" for a, v in lost.items())
         out.append(f"lost motion is in no table: set the control's own backlash parameter ({values})")
     for key in formats_in(control):
         form = FORMATS[key]
         out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
-        if not form.sign.sure:
+        if form.sign.sure:
+            continue
+        if turned is not None:
+            out.append(f"{form.name}: sign by the measured step: {'the other one than' if turned else 'as'} in docs/reference/formats.md")
+        else:
             out.append(
                 f"{form.name}: no manual states the sign ({form.sign.text}): write the 10 µm step first and measure it "
                 "(docs/reference/formats.md)"
@@ -202,15 +242,20 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool) -> tuple[s
     return tuple(out)
 
 
+def holds_lost_motion(control: ControlModel) -> bool:
+    """Whether the files of a control hold its backlash parameter."""
+    return bool(control.lines) and control.lost_motion
+
+
 def expected(known: Identified, control: ControlModel, reference_mm: F1 | None = None) -> Compensation:
     """Return the tables that an export to this control would write, rounded in the same way, without lost motion."""
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     comp = best_of(choices(known, control, reference)).compensation
-    return replace(rounded(comp, control.unit_mm), lost_motion_mm={})
+    return replace(rounded(comp, control.unit_mm), lost_motion_mm=comp.lost_motion_mm if holds_lost_motion(control) else {})
 
 
-def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Read the tables of one format, or of all formats of a control together.
+def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings, *, turned: bool = False) -> Compensation:
+    """Read the tables of one format, or of all formats of a control together; ``turned`` as in `files_of`.
 
     Raises
     ------
@@ -225,10 +270,18 @@ def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings) ->
         own_files = files if len(names) == 1 else tuple(f for f in files if belongs(f, name))
         if not own_files:
             continue
-        part = format_of(name).read(own_files, settings)
+        form = format_of(name)
+        part = form.read(own_files, settings)
+        part = negated(part) if turned and not form.sign.sure else part
         tables += part.tables
-        out = replace(out, products=out.products + part.products, lattice=out.lattice or part.lattice, motions=out.motions or part.motions)
-    if not tables and not out.products and out.lattice is None and out.motions is None:
+        out = replace(
+            out,
+            products=out.products + part.products,
+            lattice=out.lattice or part.lattice,
+            motions=out.motions or part.motions,
+            lost_motion_mm={**out.lost_motion_mm, **part.lost_motion_mm},
+        )
+    if not (tables or out.products or out.lattice or out.motions or out.lost_motion_mm):
         raise TableFileError(f"none of the files belongs to {control.name}", "give the files of one export")
     return replace(out, tables=tuple(tables))
 
@@ -251,7 +304,7 @@ def belongs(file: TextFile, key: str) -> bool:
 
 def formats_in(control: ControlModel) -> tuple[str, ...]:
     """Formats that a control reads. Where there are several, file names distinguish them, so the files always go into a folder."""
-    return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions) if k))
+    return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions, control.lines) if k))
 
 
 def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:

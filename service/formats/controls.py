@@ -38,6 +38,8 @@ class ControlModel:
         Format of a 3-D grid, and its nodes per axis.
     motions : str
         Format of the error motions from which the control computes corrections by its own kinematic chain.
+    lines, squareness, lost_motion : str, bool, bool
+        Format of commands, and what they hold.
     lookup : str
         Position at which the control looks up all tables but the own-axis ones.
     unit_mm : float
@@ -56,6 +58,9 @@ class ControlModel:
     lattice: str = ""
     nodes: int = 0
     motions: str = ""
+    lines: str = ""
+    squareness: bool = True
+    lost_motion: bool = True
     lookup: Lookup = "command"
     unit_mm: float = 1e-6
 
@@ -106,7 +111,10 @@ CONTROLS: dict[str, ControlModel] = {
         ),
         ControlModel("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),
         ControlModel("mach4", "Mach4", own="mach4", own_points=101, unit_mm=1e-4),
-        ControlModel("centroid", "Centroid, table version 1", own="centroid", own_points=101, both_directions=False, unit_mm=1e-3),
+        ControlModel("centroid", "Centroid CNC10 v2.61 to CNC12, table version 3", own="centroid", own_points=101, unit_mm=1e-4),
+        ControlModel("marlin", "Marlin: squareness and lost motion", lines="marlin"),
+        ControlModel("klipper", "Klipper: squareness", lines="klipper", lost_motion=False),
+        ControlModel("grblhal", "grblHAL: lost motion", lines="grblhal", squareness=False),
     )
 }
 
@@ -185,7 +193,29 @@ def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple
         grids = _grids(known, control.own_points, reference_mm)
         comp = Compensation(motions=motions_of(known, grids), lost_motion_mm=dict(known.lost_motion_mm))
         found.append(judge.choice("error motions, worked out by the control", comp))
+    if control.lines:
+        found += [judge.choice(kind, comp) for kind, comp in _lines(known, control, reference_mm)]
     return _marked(found)
+
+
+def _lines(known: Identified, control: ControlModel, reference_mm: F1) -> list[tuple[str, Compensation]]:
+    """Return squareness as three straight lines (X over Y, X over Z, Y over Z), and lost motion; a negative one is none.
+
+    A line of Y over X is one of X over Y and a rotation of the whole machine, which is no error.
+    """
+    lost = {a: v for a, v in known.lost_motion_mm.items() if v > 0.0}
+    if not control.squareness:
+        return [("lost motion", Compensation(lost_motion_mm=lost))]
+    x, y, z = known.machine.stroke_mm
+    ends = (x, y, z)
+    values = table_values(known, known.deviation_mm, (ends,), reference_mm, smooth=True)[0]
+    slope = [(v[1] - v[0]) / np.ptp(ends[a]) for a, v in enumerate(values)]
+    tables = []
+    for a, o in ((1, 0), (2, 0), (2, 1)):
+        line = (slope[a][o] + slope[o][a]) * (ends[a] - reference_mm[a])
+        tables.append(AxisTable(AXES[a], AXES[o], ends[a], line, line))
+    both = [("squareness and lost motion", Compensation(tuple(tables), lost_motion_mm=lost))] if control.lost_motion else []
+    return [("squareness", Compensation(tuple(tables))), *both]
 
 
 def best_of(found: tuple[FormatChoice, ...]) -> FormatChoice:

@@ -101,8 +101,6 @@ class FormatSettings:
         Fanuc: detection unit; parameter 3623; largest number that a point can hold (127; 7 on old series).
     first_point : int
         Fanuc: number of the first point that may be used.
-    counts_per_mm : float
-        Centroid: encoder counts per millimetre.
     power_of_two : bool
         The control is a Heidenhain TNC 4xx: the spacing must be a power of two times 0.1 µm.
     """
@@ -116,7 +114,6 @@ class FormatSettings:
     magnification: int = 1
     largest_step: int = 127
     first_point: int = 0
-    counts_per_mm: float = 1000.0
     power_of_two: bool = False
 
     @property

@@ -7,7 +7,7 @@ Tables are piecewise linear with their end values held.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
@@ -141,6 +141,18 @@ class Compensation:
         if self.motions is not None:
             size += sum(c.value.size for c in self.motions.curves.values()) + len(self.motions.squareness_rad)
         return size
+
+
+def negated(comp: Compensation) -> Compensation:
+    """Return all tables with the other sign; the backlash parameter stays."""
+    tables = tuple(replace(t, forward_mm=-t.forward_mm, backward_mm=-t.backward_mm) for t in comp.tables)
+    products = tuple(replace(p, angle=replace(p.angle, value=-p.angle.value)) for p in comp.products)
+    lattice = None if comp.lattice is None else replace(comp.lattice, correction_mm=-comp.lattice.correction_mm)
+    motions = comp.motions
+    if motions is not None:
+        curves = {n: replace(c, value=-c.value) for n, c in motions.curves.items()}
+        motions = replace(motions, curves=curves, squareness_rad={n: -v for n, v in motions.squareness_rad.items()})
+    return Compensation(tables, products, lattice, motions, comp.lost_motion_mm)
 
 
 def correction_at(comp: Compensation, axes_mm: F2, direction: F2 | None = None, *, lookup: Lookup = "command") -> F2:

@@ -18,6 +18,7 @@ from abbe.service.formats import (
     mach4,
     siemens_cec,
     siemens_eec,
+    skew,
 )
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import Compensation
@@ -119,12 +120,20 @@ FORMATS: dict[str, Format] = {
         Format("mach4", "Mach4 screw map (sheet)", mach4.LIMITS, mach4.SIGN, mach4.write, mach4.read, "entered by hand"),
         Format(
             "centroid",
-            "Centroid ballscrew table, version 1",
+            "Centroid ballscrew table, version 3",
             centroid.LIMITS,
             centroid.SIGN,
             centroid.write,
             centroid.read,
             "restart of the control",
+        ),
+        *(
+            Format(key, name, d.limits, skew.SIGN, partial(skew.write, dialect=d), partial(skew.read, dialect=d), live)
+            for key, name, d, live in (
+                ("marlin", "Marlin M852 and M425", skew.MARLIN, "at once; M500 keeps it"),
+                ("klipper", "Klipper SET_SKEW", skew.KLIPPER, "at once; after a restart: SKEW_PROFILE LOAD=abbe"),
+                ("grblhal", "grblHAL $160 to $162", skew.GRBLHAL, "at once"),
+            )
         ),
     )
 }

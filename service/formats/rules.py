@@ -27,7 +27,8 @@ class FormatLimits:
     """Limits of a format.
 
     ``points``: largest number per table; ``directional``: a table may differ between the directions of motion; ``size_mm``: largest
-    absolute correction; ``own`` to ``motions``: whether the format holds this kind of table.
+    absolute correction; ``own`` to ``motions``: whether the format holds this kind of table; ``lines``: its tables are straight lines;
+    ``lost_motion``: it holds a backlash parameter.
     """
 
     points: int
@@ -40,6 +41,8 @@ class FormatLimits:
     products: bool = False
     lattice: bool = False
     motions: bool = False
+    lines: bool = False
+    lost_motion: bool = False
     zero_at_reference: bool = True
 
 
@@ -62,12 +65,12 @@ def check_kinds(comp: Compensation, limits: FormatLimits, what: str) -> None:
         (limits.products, bool(comp.products), "products of two tables"),
         (limits.lattice, comp.lattice is not None, "a 3-D grid"),
         (limits.motions, comp.motions is not None, "error motions"),
-        (False, any(comp.lost_motion_mm.values()), "a backlash parameter"),
+        (limits.lost_motion, any(comp.lost_motion_mm.values()), "a backlash parameter"),
     )
     for able, there, kind in kinds:
         if there and not able:
             raise FormatRefused(f"{what} cannot hold {kind}", f"choose another format; {NOTHING}")
-    if not (comp.tables or comp.products or comp.lattice or comp.motions):
+    if not (comp.tables or comp.products or comp.lattice or comp.motions or any(comp.lost_motion_mm.values())):
         raise FormatRefused(f"{what}: there is nothing to write", "give tables")
 
 

@@ -3,7 +3,10 @@
 If the two directions differ, there are two tables, with $AN_CEC_DIRECTION 1 and -1. For a product, $AN_CEC_MULT_BY_TABLE[t] = n multiplies
 table t by table n (index n - 1). As in the manual's grid example (6FC5397-1BP40-3BA1 p. 259), only the product acts; the factor table by
 itself is switched off ($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first (docs/reference/formats.md).
-Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the command.
+The sign is in no manual. Two public writers, apparently of one builder (rotary tables, both directions), write measured - nominal, +e; we
+write −e because the sum is added to the setpoint. The measured step decides:
+``--step-moved 10`` turns the sign. Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the
+command.
 """
 
 from __future__ import annotations
@@ -19,7 +22,7 @@ from abbe.service.formats.rules import FormatLimits, SignRule, check_kinds, chec
 from abbe.service.formats.siemens import END, HEAD, POSITION_DECIMALS, Assignments, grid, parse, step_of
 
 LIMITS = FormatLimits(points=2000, equidistant=True, own=True, cross=True, products=True)
-SIGN = SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; not stated in a manual")
+SIGN = SignRule(-1, False, "by manual", False, "added to the setpoint of the compensated axis: −e; in no manual; two public tools write +e")
 LEVERS = FormatLimits(points=2000, equidistant=True, size_mm=1e5)
 WHAT = "Siemens CEC"
 NAME = "NC_CEC.INI"

@@ -38,6 +38,17 @@ ReferenceOption = Annotated[
 ]
 
 
+StepOption = Annotated[
+    float | None,
+    typer.Option(
+        "--step-moved",
+        metavar="UM",
+        help="By how much the axis moved when the 10 µm step was loaded, µm: -10 confirms the sign, 10 turns it.",
+        show_default=False,
+    ),
+]
+
+
 @comp.command("formats")
 def list_formats(as_json: JsonOption = False) -> None:
     """List formats and controls: what each can hold, and how its sign is known."""
@@ -64,6 +75,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         Path, typer.Option("--out", metavar="FILE", help="File; a new folder if the format has several files.", show_default=False)
     ],
     reference: ReferenceOption = None,
+    step_moved: StepOption = None,
     without_table: Annotated[
         bool, typer.Option("--without-table", help="I know that no correction was in force while this was measured.")
     ] = False,
@@ -88,6 +100,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         identified,
         reference_of,
         sign_files,
+        sign_is_turned,
         write_files,
     )
     from abbe.service.verification.reduction import UNKNOWN
@@ -97,7 +110,9 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
     fresh = _fresh(solution, db, machine, confirmed_none=without_table)
-    made = export(known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN)
+    made = export(
+        known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN, turned=sign_is_turned(step_moved)
+    )
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:
         written.append(str(sign_files(out, form, config, seal, SystemClock().utc())))
@@ -121,6 +136,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
         str | None, typer.Option("--solution", metavar="SOLUTION", help="Compare with the tables of this solution.", show_default=False)
     ] = None,
     reference: ReferenceOption = None,
+    step_moved: StepOption = None,
     trust: Annotated[
         list[str] | None,
         typer.Option("--trust", metavar="KEY", help="Public key whose signature counts, besides the machine file's.", show_default=False),
@@ -144,6 +160,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
         reference_of,
         seal_status,
         settings_for,
+        sign_is_turned,
     )
     from abbe.service.formats.compare import check_same
 
@@ -154,7 +171,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     start = at if at is not None else nominal.stroke_mm[:, 0]
     files = read_files(file)
     status = seal_status(file, files, _machine_file(machine), SigningRequest(form, tuple(trust or ()), base), SystemClock().utc())
-    found = read_key(form, files, settings_for(control, nominal, start))
+    found = read_key(form, files, settings_for(control, nominal, start), turned=sign_is_turned(step_moved) or False)
     doc: dict[str, Any] = {"tables": _tables(found), "status": "signed" if status.signed else "candidate", "why": status.why}
     if known is not None:
         same = check_same(found, expected(known, control, at), 0.51 * control.unit_mm + 1e-6)
@@ -221,13 +238,15 @@ def _choice(c: FormatChoice) -> dict[str, Any]:
 
 
 def _holds(limits: Any) -> str:
-    kinds = ("own", "cross", "products", "lattice", "motions")
-    possible = [kind for kind in kinds if getattr(limits, kind)]
+    kinds = ("own", "cross", "products", "lattice", "motions", "lines", "lost_motion")
+    possible = [kind.replace("_", " ") for kind in kinds if getattr(limits, kind)]
     return ", ".join(possible) + ("; both directions" if limits.directional and limits.own else "")
 
 
 def _tables(found: Compensation) -> list[dict[str, Any]]:
     """Return one row per table: its name, number of points, range of positions, smallest and largest correction."""
+    import numpy as np
+
     rows = []
     for t in found.tables:
         ways = [("", t.forward_mm)] if not t.directional else [(", moving in +", t.forward_mm), (", moving in −", t.backward_mm)]
@@ -242,7 +261,7 @@ def _tables(found: Compensation) -> list[dict[str, Any]]:
         for name, c in found.motions.curves.items():
             angle = name[1] in "ABC"
             rows.append(_row(f"error motion {name}", c.position_mm, c.value * (1e6 if angle else 1e3), "µrad" if angle else "µm"))
-    return rows
+    return rows + [_row(f"lost motion of {a}", np.zeros(1), np.array([v * 1e3]), "µm") for a, v in found.lost_motion_mm.items()]
 
 
 def _row(name: str, position: Any, value: Any, unit: str) -> dict[str, Any]:

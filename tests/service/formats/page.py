@@ -26,11 +26,15 @@ _PROOF = """
 ## The 10 µm step
 
 Before the first real table: an error of +10 µm at one place is written, and the axis is measured there. If it moves as in the last column,
-sign, axis, unit and scale are right. If it moves by another amount or in the other direction, nothing may be loaded. Points at 0, 50, 100,
+sign, axis, unit and scale are right. If it moves by 10 µm the other way, `abbe comp export --step-moved 10` writes the other sign, where
+no manual states it; `--step-moved -10` records that the sign is confirmed. By another amount: nothing may be loaded. Points at 0, 50, 100,
 150, 200 mm, reference 0; products: 50 µrad at Y 100 times a lever of 200 mm; grid: nodes at 0, 100, 200.
 
 | format | table | lines of the file that are not as in a table of zeros | place | the axis has to move by |
 |---|---|---|---|---|
+"""
+_CEC = """
+Siemens CEC: two public tools of rotary tables, apparently of one builder, write +e; no manual states the sign.
 """
 _CONTROLS = """
 ## Controls
@@ -38,7 +42,7 @@ _CONTROLS = """
 What `abbe comp export --format CONTROL` chooses among. Order of effects: own-axis tables act first; where a control looks the others up is
 in the last column.
 
-| control | what | own-axis | cross and products | grid or motions | looked up at |
+| control | what | own-axis | cross and products | grid, motions or commands | looked up at |
 |---|---|---|---|---|---|
 """
 
@@ -47,8 +51,8 @@ def page() -> str:
     """The whole page."""
     text = _HEAD
     for f in FORMATS.values():
-        words = ("own", "cross", "products", "lattice", "motions")
-        held = ", ".join(w for w in words if getattr(f.limits, w))
+        words = ("own", "cross", "products", "lattice", "motions", "lines", "lost_motion")
+        held = ", ".join(w.replace("_", " ") for w in words if getattr(f.limits, w))
         held += "; both directions" if f.limits.own and f.limits.directional else ""
         sure = "" if f.sign.sure else " **(see the step first)**"
         text += f"| `{f.key}` {f.name} | {held} | {f.limits.points} | {f.sign.text}{sure} | {f.sign.evidence} | {f.live} |\n"
@@ -58,12 +62,12 @@ def page() -> str:
         way = "+" if p.direction > 0 else "−"
         lines = "<br>".join(f"`{line}`" for line in p.lines)
         text += f"| `{p.format}` | {p.what} | {lines} | {at}, moving in {way} | {p.axis} {p.added_mm * 1e3:+.3f} µm |\n"
-    text += _CONTROLS
+    text += _CEC + _CONTROLS
     for c in CONTROLS.values():
         own = f"`{c.own}`, {c.own_points} points, {'both directions' if c.both_directions else 'one direction'}" if c.own else "none"
         cross = f"`{c.cross}`, {c.cross_points} points" + (", products" if c.products else "") if c.cross else "none"
         cross += f", at most {c.tables} tables" if c.tables is not None else ""
-        rest = f"`{c.lattice}`, {c.nodes} nodes an axis" if c.lattice else f"`{c.motions}`" if c.motions else "none"
+        rest = f"`{c.lattice}`, {c.nodes} nodes an axis" if c.lattice else f"`{c.motions or c.lines}`" if c.motions or c.lines else "none"
         text += f"| `{c.key}` | {c.name} | {own} | {cross} | {rest} | {c.lookup} |\n"
     return text
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS, Format
@@ -63,6 +64,16 @@ def _cases(form: Format) -> list[Case]:
     spike = np.where(np.arange(POSITION_MM.size) == AT, -STEP_MM, 0.0)
     place = float(POSITION_MM[AT])
     cases: list[Case] = []
+    if form.limits.lost_motion:
+        lost = [Compensation(lost_motion_mm={"X": v, "Y": 1.0}) for v in (STEP_MM, 0.0)]
+        cases.append(("lost motion of X", "X", (place, 0.0, 0.0), -1, lost[0], lost[1]))
+    if form.limits.lines:
+        ends = POSITION_MM[[0, -1]]
+        for axis, output in skew.PAIRS if form.limits.cross else ():
+            line = [Compensation((AxisTable(axis, output, ends, v, v),)) for v in (-STEP_MM / 100.0 * ends, 0.0 * ends)]
+            at = tuple(float(place) if a == axis else 0.0 for a in AXES)
+            cases.append((f"{output} over {axis}, 100 µrad", output, (at[0], at[1], at[2]), 1, line[0], line[1]))
+        return cases
     for able, output, what in ((form.limits.own, "X", "X over X"), (form.limits.cross, "Y", "Y over X")):
         if able:
             tables = [Compensation((AxisTable("X", output, POSITION_MM, v, v),)) for v in (spike, 0.0 * spike)]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -134,10 +135,45 @@ def test_export_and_import_by_the_commands(key: str, tmp_path: Path, capsys: pyt
     assert run(["comp", "import", str(out), "--format", name, "--solution", str(source), "--json"]) == 0, capsys.readouterr().err
     told = json.loads(capsys.readouterr().out)
     assert told["tables"]
-    unit = 1e3 * {"fanuc": 1e-3, "fanuc-30i": 1e-3, "fanuc-lattice": 1e-3, "centroid": 1e-3, "heidenhain": 1e-4, "mach4": 1e-4}.get(
+    unit = 1e3 * {"fanuc": 1e-3, "fanuc-30i": 1e-3, "fanuc-lattice": 1e-3, "centroid": 1e-4, "heidenhain": 1e-4, "mach4": 1e-4}.get(
         key, 1e-6
     )
     assert max(told["differences_um"].values()) <= 0.51 * unit + 1e-3
+
+
+def test_the_measured_step_turns_the_sign_where_no_manual_states_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    source = tmp_path / "solution.json"
+    source.write_text(json.dumps(_document(_known())))
+    told = {}
+    for moved in ("-10.8", "9.5"):
+        out = tmp_path / f"out{moved}"
+        word = ["--step-moved", moved, "--format", "siemens-840d"]
+        assert run(["comp", "export", str(source), "--out", str(out), *word]) == 0
+        assert "Siemens CEC: sign by the measured step" in capsys.readouterr().out
+        assert run(["comp", "import", str(out), "--solution", str(source), *word]) == 0, capsys.readouterr().err
+        told[moved] = {f.name: f.read_text() for f in out.iterdir()}
+    as_is, other = told.values()
+    assert as_is["AX_EEC.INI"] == other["AX_EEC.INI"]  # a manual states this one
+    first = re.search(r"\$AN_CEC\[0,12\]=(.*)", as_is["NC_CEC.INI"])
+    assert first is not None
+    assert f"$AN_CEC[0,12]={-float(first.group(1))}" in other["NC_CEC.INI"]
+    assert run(["comp", "import", str(out), "--solution", str(source), "--format", "siemens-840d"]) == 2  # another sign than expected
+    assert run(["comp", "export", str(source), "--out", str(tmp_path / "x"), "--format", "siemens-840d", "--step-moved", "1"]) == 2
+    assert "neither -10 nor +10" in capsys.readouterr().err
+
+
+def test_skew_commands_leave_less_than_nothing_and_say_so() -> None:
+    """A machine out of square only, with lost motion: Marlin corrects both, Klipper the squareness, grblHAL the lost motion."""
+    known = _known(lost=(0.010, 0.010, -0.002))
+    square = replace(known, coefficients=np.where([t.order == 0 for t in known.terms], known.coefficients, 0.0))
+    left = {}
+    for key in ("marlin", "klipper", "grblhal"):
+        found = choices(square, CONTROLS[key], START)
+        left[key] = best_of(found).rms_mm
+        assert left[key] < found[0].rms_mm
+    assert left["marlin"] == pytest.approx(0.001, rel=0.05)  # the negative lost motion of Z is no lost motion
+    assert left["marlin"] < min(left["klipper"], left["grblhal"])
+    assert not any("own backlash parameter" in n for n in export(square, "marlin").notes)
 
 
 def test_turned_sign_is_named_and_nothing_is_half_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -7,11 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS
 from tests.service.formats.page import PAGE, page
-from tests.service.formats.proof import all_proofs
+from tests.service.formats.proof import SETTINGS, all_proofs
 
 # controllers.md 5.7, by hand: what +10 µm of error at 100 mm must be in each file.
 STEP = {
@@ -25,7 +26,9 @@ STEP = {
     ("fanuc-pitch", "X over X"): "N10001Q1P-10",
     ("fanuc-lattice", "3-D grid, X"): "14,100,100,100,-10,0,0",
     ("mach4", "X over X"): "3,100.0,-0.0100,-0.0100",
-    ("centroid", "X over X"): "-10",
+    ("centroid", "X over X"): "100\t-0.01\t-0.01",
+    ("marlin", "X over Y, 100 µrad"): "M852 I0.00010000000 J0.00000000000 K0.00000000000",
+    ("grblhal", "lost motion of X"): "$160=0.0100",
 }
 
 
@@ -153,50 +156,38 @@ def test_fanuc_example_sums_up_as_drawn() -> None:
     assert form.write(comp, settings)[0].text == text
 
 
-CENTROID = (
-    "24 -1448819\n"
-    + "\n".join(
-        map(
-            str,
-            (
-                0,
-                -32,
-                -38,
-                -47,
-                -54,
-                -57,
-                -63,
-                -69,
-                -76,
-                -82,
-                -88,
-                -98,
-                -101,
-                -110,
-                -113,
-                -120,
-                -123,
-                -129,
-                -132,
-                -135,
-                -139,
-                -142,
-                -145,
-                -148,
-            ),
-        )
-    )
-    + "\n"
-)
+CENTROID = """CNC10 TAB FILE VERSION 3
+AXIS X
+UNITS MM
+INTERVAL 25
+ENTRIES 10
+"""
 
 
-def test_centroid_example_comes_back_byte_for_byte() -> None:
-    """cncsnw.com, version 1: 24 values over -1448819 counts, which is 40 mm a point at 40000 counts an inch."""
-    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), counts_per_mm=40000 / 25.4)
+def test_centroid_file_of_a_control_comes_back_byte_for_byte() -> None:
+    """cnc-x.tab of github.com/teno1608/PLC-CNC-lathe-machine: ten entries of zeros, from the reference in −."""
+    text = CENTROID + "".join(f"{-25 * k}\t0\t0\n" for k in range(10))
+    settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
     form = FORMATS["centroid"]
-    comp = form.read((TextFile("cnc-x.tab", CENTROID),), settings)
-    assert comp.tables[0].position_mm[0] == pytest.approx(-920.0, abs=1e-3)
-    assert form.write(comp, settings)[0].text == CENTROID
+    comp = form.read((TextFile("cnc-x.tab", text),), settings)
+    assert comp.tables[0].position_mm.tolist() == [25.0 * k for k in range(-9, 1)]
+    assert form.write(comp, settings)[0].text == text
+
+
+def test_skew_factor_of_marlin_and_klipper() -> None:
+    """formats-fields.md: AC 140.4, BD 142.8, AD 99.8 give AB 100.4587477525 and XY -0.0169507368."""
+    factor = skew.factor_of(140.4, 142.8, 99.8)
+    assert factor == pytest.approx(-0.0169507368, abs=1e-9)
+    assert skew.factor_of(*skew.lengths_of(factor)) == pytest.approx(factor, abs=1e-12)
+    square = skew.lengths_of(0.0)
+    assert square == pytest.approx((141.4213562373, 141.4213562373, 100.0), abs=1e-9)
+
+
+@pytest.mark.parametrize(("key", "command"), [("marlin", "M852 I-0.0169507368"), ("klipper", "SET_SKEW XY=140.4,142.8,99.8")])
+def test_a_skew_that_was_measured_moves_x_as_the_programs_do(key: str, command: str) -> None:
+    """x - y factor: with the factor of the vector, Y 100 moves X by +1.69507 mm."""
+    comp = FORMATS[key].read((TextFile("a.gcode", command + "\n"),), SETTINGS)
+    assert correction_at(comp, np.array([[0.0, 100.0, 0.0]]))[0] == pytest.approx([1.69507368, 0.0, 0.0], abs=1e-7)
 
 
 ISG = """// component errors of the X axis
@@ -208,8 +199,6 @@ X EXX EYX EZX EAX EBX ECX
 
 def test_isg_example_is_read_number_by_number() -> None:
     """Page 296429067. Its numbers have no one way of writing (0.02, 0.00): it comes back equal in value, not in bytes."""
-    from tests.service.formats.proof import SETTINGS
-
     form = FORMATS["isg"]
     comp = form.read((TextFile("volcomp.csv", ISG),), SETTINGS)
     assert comp.motions is not None

@@ -18,6 +18,7 @@ V = np.array([0.0, -0.010, 0.004])
 GOOD = Compensation((AxisTable("X", "X", P, V, V - 0.003),))
 TOLD = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
 
+CENTROID = "CNC10 TAB FILE VERSION 3\nAXIS X\nUNITS MM\nINTERVAL 25\nENTRIES 3\n"
 MACH4 = "axis,X\nstart_mm,0\nlength_mm,10\npoints,3\npoint,position_mm,error_plus_mm,error_minus_mm\n"
 BAD_FILES = [
     ("linuxcnc-1", "x.comp", "# made by hand\n0 0 0\n100 0.01 0.01\n", r"x\.comp:1: .*ends the table here"),
@@ -41,7 +42,16 @@ BAD_FILES = [
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,9,0,0\n", r"m\.csv:7"),
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n", "2 points, but the heading states 3: the file is cut off"),
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n3,10,0,0\n4,15,0,0\n", "4 points, but the heading states 3 -"),
-    ("centroid", "cnc-x.tab", "3 1000\n0\n1\n", "2 values, 3 stated"),
+    ("centroid", "cnc-x.tab", "3 1000\n0\n1\n", r"cnc-x\.tab:1: the first line is '3 1000'"),
+    ("centroid", "cnc-x.tab", CENTROID + "0\t0\t0\n25\t0\t0\n", "2 entries, 3 stated"),
+    ("centroid", "cnc-x.tab", CENTROID + "0\t0\t0\n25\t0\t0\n75\t0\t0\n", r"cnc-x\.tab:8: position 75 after 25"),
+    ("centroid", "cnc-x.tab", CENTROID.replace("MM", "INCH"), r"cnc-x\.tab:3: axis X, units INCH"),
+    ("marlin", "a.gcode", "M852 I0.001\nM206 X1\n", r"a\.gcode:2: M206 is neither"),
+    ("marlin", "a.gcode", "M852 I0.001 K1e\n", r"a\.gcode:1: K is '1e'"),
+    ("marlin", "a.gcode", "M425 X0.01 F0.5\n", r"a\.gcode:1: F0\.5 corrects a part"),
+    ("klipper", "a.gcode", "SET_SKEW XY=140.4,142.8\n", r"a\.gcode:1: .* three lengths"),
+    ("klipper", "a.gcode", "SET_SKEW XY=1,1,99\n", r"a\.gcode:1: .*no figure"),
+    ("grblhal", "a.txt", "$100=0.1\n", r"a\.txt:1: \$100 is neither"),
     ("fanuc-lattice", "l.csv", "x,y,z\n", r"l\.csv:1: the heading"),
     ("isg", "v.csv", "X EXX\n0 0\n10 0.1\n5 0.2\n", r"v\.csv:4: position 5 after 10"),
     ("isg", "v.csv", "X EXX EYY\n0 0 0\n", r"v\.csv:1: EYY is not an error motion of X"),
@@ -81,6 +91,11 @@ REFUSED = [
     ("centroid", _table(P, V - V[1]), replace(TOLD, reference_mm=(100.0, 0.0, 0.0)), "neither end"),
     ("mach4", Compensation(), TOLD, "nothing to write"),
     ("fanuc-lattice", Compensation(lattice=Lattice((P, P, np.array([0.0, 1.0, 5.0])), np.zeros((3, 3, 3, 3)))), TOLD, "equal distances"),
+    ("marlin", Compensation((AxisTable("Y", "X", P, V, V),)), TOLD, "only straight lines"),
+    ("marlin", Compensation((AxisTable("X", "Y", P, P * 1e-5, P * 1e-5),)), TOLD, "only straight lines"),
+    ("marlin", Compensation(lost_motion_mm={"X": -0.001}), TOLD, "negative"),
+    ("klipper", Compensation(lost_motion_mm={"X": 0.001}), TOLD, "cannot hold a backlash parameter"),
+    ("grblhal", Compensation((AxisTable("Y", "X", P[:2], V[:2], V[:2]),)), TOLD, "cannot hold the table"),
     ("isg", Compensation(lattice=Lattice((P, P, P), np.zeros((3, 3, 3, 3)))), TOLD, "cannot hold a 3-D grid"),
 ]
 

@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES, Machine
+from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable
 from abbe.service.formats.registry import FORMATS, Format
@@ -22,6 +23,8 @@ EXACT_MM = 1e-9
 @st.composite
 def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, FormatSettings]:
     rng = np.random.default_rng(draw(st.integers(0, 2**32 - 1)))
+    if form.limits.lines:
+        return _commands(rng, form), FormatSettings(machine=MACHINE, decimals=draw(st.integers(3, 7)), reference_mm=(0.0, 0.0, 0.0))
     n = draw(st.integers(3, min(form.limits.points, 40)))
     decimals = draw(st.integers(3, 7))
     told = FormatSettings(
@@ -35,7 +38,7 @@ def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, FormatSettings]:
     even = form.limits.equidistant or draw(st.booleans())
     size = draw(st.sampled_from([1e-5, 0.003, 0.05]))
     if form.key in ("fanuc-pitch", "fanuc-lattice", "centroid"):
-        told = replace(told, reference_mm=(0.0, 0.0, 0.0), counts_per_mm=draw(st.sampled_from([1000.0, 40000 / 25.4])), largest_step=10**6)
+        told = replace(told, reference_mm=(0.0, 0.0, 0.0), largest_step=10**6)
     grids = [_grid(rng, n if not form.limits.lattice else min(n, 6), step, even) for _ in AXES]
     if form.limits.lattice:
         values = rng.uniform(-size, size, (*(g.size for g in grids), 3))
@@ -51,6 +54,15 @@ def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, FormatSettings]:
         angle = AxisCurve("Y", grids[1], rng.uniform(-1, 1, grids[1].size) * size * 1e-3)
         products = (ProductTable("X", angle, AxisCurve("Z", grids[2], np.round(grids[2] - grids[2][0], 3))),)
     return Compensation(tables, products), told
+
+
+def _commands(rng: np.random.Generator, form: Format) -> Compensation:
+    lost = dict(zip(AXES, rng.uniform(0.001, 0.05, 3).tolist(), strict=True)) if form.limits.lost_motion else {}
+    tables = []
+    for (axis, output), slope in zip(skew.PAIRS, rng.uniform(-1e-3, 1e-3, 3), strict=True):
+        position = MACHINE.stroke_mm[AXES.index(axis)]
+        tables.append(AxisTable(axis, output, position, slope * position, slope * position))
+    return Compensation(tuple(tables) if form.limits.cross else (), lost_motion_mm=lost)
 
 
 def _grid(rng: np.random.Generator, n: int, step: float, even: bool) -> np.ndarray:
@@ -76,7 +88,7 @@ def _motions(rng: np.random.Generator, grids: list[np.ndarray], size: float) -> 
 def _unit(form: Format, told: FormatSettings) -> float:
     if form.key.startswith("fanuc"):
         return told.unit_mm * told.magnification
-    return 1.0 / told.counts_per_mm if form.key == "centroid" else told.step_mm
+    return told.step_mm
 
 
 @pytest.mark.parametrize("key", FORMATS)
@@ -95,6 +107,7 @@ def test_nothing_differs_by_more_than_half_a_unit(key: str, data: st.DataObject)
             assert np.abs(curve.value + t.forward_mm).max() <= half
         return
     _compare_tables(comp, found, half)
+    assert dict(found.lost_motion_mm) == pytest.approx(dict(comp.lost_motion_mm), abs=half)
     for p, q in zip(comp.products, found.products, strict=True):
         assert (p.output, p.angle.axis, p.lever.axis) == (q.output, q.angle.axis, q.lever.axis)
         assert np.abs(p.angle.value - q.angle.value).max() <= half * 1e-3 + 1e-12
