@@ -138,6 +138,7 @@ def settings_for(control: ControlModel, machine: Machine, reference_mm: F1) -> F
 
 
 STEP_UM, STEP_SHARE = 10.0, 0.2
+MOTIONS_ADD_UP = 6.0
 
 
 def sign_is_turned(step_moved_um: float | None) -> bool | None:
@@ -252,6 +253,11 @@ def expected(known: Identified, control: ControlModel, reference_mm: F1 | None =
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     comp = best_of(choices(known, control, reference)).compensation
     return replace(rounded(comp, control.unit_mm), lost_motion_mm=comp.lost_motion_mm if holds_lost_motion(control) else {})
+
+
+def alike_mm(control: ControlModel) -> float:
+    """Return the largest difference by rounding between tables read and expected, mm; of error motions, several add up."""
+    return (MOTIONS_ADD_UP if control.motions else 1.0) * 0.51 * control.unit_mm + 1e-6
 
 
 def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings, *, turned: bool = False) -> Compensation:

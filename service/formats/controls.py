@@ -77,6 +77,7 @@ CONTROLS: dict[str, ControlModel] = {
             cross_points=16,
             products=True,
         ),
+        ControlModel("linuxcnc-kins", "LinuxCNC: kinematics component", lattice="linuxcnc-kins", nodes=33),
         ControlModel(
             "siemens-840d",
             "SINUMERIK 840D sl: ENC_COMP and CEC",
@@ -107,6 +108,13 @@ CONTROLS: dict[str, ControlModel] = {
             own_points=101,
             cross_points=101,
             cross="heidenhain",
+            unit_mm=1e-4,
+        ),
+        ControlModel(
+            "heidenhain-kinematics",
+            "Heidenhain TNC with KinematicsComp: 18 motions and squareness",
+            motions="heidenhain-kinematics",
+            own_points=101,
             unit_mm=1e-4,
         ),
         ControlModel("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),

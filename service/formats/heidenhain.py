@@ -57,16 +57,31 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         _check_positions(mine, settings)
         names[axis] = f"{axis}.COM"
         files.append(TextFile(names[axis], _com(axis, mine, settings)))
+    return (*files, assignment(names))
+
+
+def assignment(names: dict[str, str]) -> TextFile:
+    """Return the .CMA that assigns a file to each axis, with its only line active."""
     head = "NR   " + "".join(f"{a:<12}" for a in AXES) + "ACTIVE"
     row = "0    " + "".join(f"{names.get(a, ''):<12}" for a in AXES) + "*"
-    files.append(TextFile(ASSIGNMENT, "\n".join([f"BEGIN {ASSIGNMENT}", head, row, "[END]"]) + "\n"))
-    return tuple(files)
+    return TextFile(ASSIGNMENT, "\n".join([f"BEGIN {ASSIGNMENT}", head, row, "[END]"]) + "\n")
+
+
+def check_fine(position: F1, axis: str, what: str) -> None:
+    """Refuse positions finer than 0.1 µm.
+
+    Raises
+    ------
+    FormatRefused
+        A position needs more decimals than are written.
+    """
+    if np.abs(np.round(position, POSITION_DECIMALS) - position).max() > 1e-7:
+        raise FormatRefused(f"{what}: positions over {axis} are finer than 0.1 µm", f"choose another grid; {NOTHING}")
 
 
 def _check_positions(tables: list[AxisTable], settings: FormatSettings) -> None:
     position = tables[0].position_mm
-    if np.abs(np.round(position, POSITION_DECIMALS) - position).max() > 1e-7:
-        raise FormatRefused(f"{WHAT}: positions over {tables[0].axis} are finer than 0.1 µm", f"choose another grid; {NOTHING}")
+    check_fine(position, tables[0].axis, WHAT)
     if not settings.power_of_two:
         return
     units = np.diff(position) / UNIT_MM
@@ -107,19 +122,28 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
         The number of active lines is not one, a named file or [END] is missing (truncated file), there are too many points, or positions
         do not increase.
     """
+    return Compensation(tuple(table for axis, file in assigned(files) for table in _read_com(file, axis)))
+
+
+def assigned(files: tuple[TextFile, ...]) -> list[tuple[str, TextFile]]:
+    """Return the axes and their .COM files by the active line of the .CMA; without a .CMA by the first letter of the names.
+
+    Raises
+    ------
+    TableFileError
+        The number of active lines is not one, or a named file is missing.
+    """
     by_name = {f.name.upper(): f for f in files}
     cma = next((f for n, f in by_name.items() if n.endswith(".CMA")), None)
     names = {n[:1]: n for n in by_name if n.endswith(".COM")} if cma is None else _active(cma)
-    tables: list[AxisTable] = []
-    for axis, name in sorted(names.items()):
+    for name in names.values():
         if name not in by_name:
             assert cma is not None
             raise cma.wrong(3, f"the file {name} of the active line is missing")
-        tables += _read_com(by_name[name], axis)
-    return Compensation(tuple(tables))
+    return [(axis, by_name[name]) for axis, name in sorted(names.items())]
 
 
-def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
+def body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
     """Return the column names of a table between BEGIN and [END], and its rows with their line numbers."""
     lines = list(file.lines())
     if not lines or not lines[0][1].startswith("BEGIN "):
@@ -133,7 +157,7 @@ def _body(file: TextFile) -> tuple[list[str], list[tuple[int, list[str]]]]:
 
 def _active(cma: TextFile) -> dict[str, str]:
     lines = list(cma.lines())
-    columns, rows = _body(cma)
+    columns, rows = body(cma)
     active = [n for n, cells in rows if cells and cells[-1] == "*"]
     if len(active) != 1:
         raise cma.wrong(active[1] if active else 3, f"{len(active)} lines are active, expected one")
@@ -144,7 +168,7 @@ def _active(cma: TextFile) -> dict[str, str]:
 
 
 def _read_com(file: TextFile, axis: str) -> list[AxisTable]:
-    columns, rows = _body(file)
+    columns, rows = body(file)
     if columns[:2] != ["NR", "AXISPOS"] or not set(columns[2:]) <= {"BACKLASH", *AXES} or not set(columns) & set(AXES):
         raise file.wrong(2, f"columns {' '.join(columns)}, expected NR AXISPOS [BACKLASH] and axes")
     if len(rows) > LIMITS.points:

@@ -152,6 +152,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import (
         SigningRequest,
+        alike_mm,
         control_for,
         expected,
         identified,
@@ -174,7 +175,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     found = read_key(form, files, settings_for(control, nominal, start), turned=sign_is_turned(step_moved) or False)
     doc: dict[str, Any] = {"tables": _tables(found), "status": "signed" if status.signed else "candidate", "why": status.why}
     if known is not None:
-        same = check_same(found, expected(known, control, at), 0.51 * control.unit_mm + 1e-6)
+        same = check_same(found, expected(known, control, at), alike_mm(control))
         doc["differences_um"] = {d.axis: d.size_mm * 1e3 for d in same}
     if as_json:
         print_json(doc)

@@ -12,18 +12,15 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings
-from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS, Format
 
 STEP_MM = 0.010
 POSITION_MM = np.array([0.0, 50.0, 100.0, 150.0, 200.0])
 AT = 2
 """Index of the place of the step."""
-SETTINGS = FormatSettings(
-    reference_mm=(0.0, 0.0, 0.0),
-    decimals=4,
-    machine=Machine("w-X-Y-b-Z-t", np.array([[0.0, 200.0]] * 3)),
-)
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 200.0]] * 3))
+SETTINGS = FormatSettings(reference_mm=(0.0, 0.0, 0.0), decimals=4, machine=MACHINE)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,10 +83,22 @@ def _cases(form: Format) -> list[Case]:
         lever = AxisCurve("Z", POSITION_MM, POSITION_MM)
         both = [Compensation(products=(ProductTable("X", AxisCurve("Y", POSITION_MM, v / 200.0), lever),)) for v in (spike, 0.0 * spike)]
         cases.append(("X over Y times Z", "X", (0.0, place, 200.0), 1, both[0], both[1]))
+    if form.limits.motions and not form.limits.own:
+        cases += _motions(place)
     if form.limits.lattice:
         nodes = (POSITION_MM[[0, AT, 4]],) * 3
         value = np.zeros((3, 3, 3, 3))
         value[1, 1, 1, 0] = -STEP_MM
         grids = [Compensation(lattice=Lattice(nodes, v)) for v in (value, 0.0 * value)]
         cases.append(("3-D grid, X", "X", (place, place, place), 1, grids[0], grids[1]))
+    return cases
+
+
+def _motions(place: float) -> list[Case]:
+    """A straightness, and an angle at a lever: errors of +10 µm and +50 µrad."""
+    cases: list[Case] = []
+    for name, output, z in (("EYX", "Y", 0.0), ("EBX", "X", 200.0)):
+        value = np.where(place == POSITION_MM, STEP_MM if z == 0.0 else STEP_MM / z, 0.0)
+        two = [Compensation(motions=Motions(MACHINE, {name: AxisCurve("X", POSITION_MM, v)}, {})) for v in (value, 0.0 * value)]
+        cases.append((name if z == 0.0 else f"{name}, 50 µrad", output, (place, 0.0, z), 1, two[0], two[1]))
     return cases

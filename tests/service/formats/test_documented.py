@@ -9,7 +9,7 @@ import pytest
 
 from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings, TextFile
-from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Motions, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS
 from tests.service.formats.page import PAGE, page
 from tests.service.formats.proof import SETTINGS, all_proofs
@@ -27,6 +27,8 @@ STEP = {
     ("fanuc-lattice", "3-D grid, X"): "14,100,100,100,-10,0,0",
     ("mach4", "X over X"): "3,100.0,-0.0100,-0.0100",
     ("centroid", "X over X"): "100\t-0.01\t-0.01",
+    ("heidenhain-kinematics", "EYX"): "2    100.0000     0.0000        0.0100        0.0000        0.0000000     0.0000000     0.0000000",
+    ("linuxcnc-kins", "3-D grid, X"): "    {-0.01, 0, 0},",
     ("marlin", "X over Y, 100 µrad"): "M852 I0.00010000000 J0.00000000000 K0.00000000000",
     ("grblhal", "lost motion of X"): "$160=0.0100",
 }
@@ -39,7 +41,9 @@ def test_step_stands_in_every_file_as_the_specification_says() -> None:
         assert line in found[key].lines, key
     for proof in found.values():
         assert proof.lines
-        assert proof.added_mm == pytest.approx(-0.010, abs=1e-9), proof
+        # An angle in degrees is rounded to 1e-7, and acts at a lever of 200 mm.
+        rounding = 0.5 * np.radians(1e-7) * 200.0 if "EBX" in proof.what else 1e-9
+        assert proof.added_mm == pytest.approx(-0.010, abs=rounding), proof
 
 
 def test_page_is_current() -> None:
@@ -188,6 +192,21 @@ def test_a_skew_that_was_measured_moves_x_as_the_programs_do(key: str, command: 
     """x - y factor: with the factor of the vector, Y 100 moves X by +1.69507 mm."""
     comp = FORMATS[key].read((TextFile("a.gcode", command + "\n"),), SETTINGS)
     assert correction_at(comp, np.array([[0.0, 100.0, 0.0]]))[0] == pytest.approx([1.69507368, 0.0, 0.0], abs=1e-7)
+
+
+def test_heidenhain_kinematics_are_the_motions_of_the_manual_with_squareness() -> None:
+    """iTNC 530 HSCI p. 680: C1 to C6 are EXX EYX EZX EAX EBX ECX; squareness C0Y of 100 µrad is a line of EXY, -0.1 mm a metre."""
+    p = np.array([0.0, 100.0, 200.0])
+    names = ("EXX", "EYX", "EZX", "EAX", "EBX", "ECX")
+    curves = {n: AxisCurve("X", p, np.array([0.0, 1.0, 0.0]) * (0.001 * (k + 1) if k < 3 else 1e-5 * k)) for k, n in enumerate(names)}
+    assert SETTINGS.machine is not None
+    files = FORMATS["heidenhain-kinematics"].write(Compensation(motions=Motions(SETTINGS.machine, curves, {"C0Y": 1e-4})), SETTINGS)
+    text = {f.name: [line.split() for line in f.text.splitlines()] for f in files}
+    assert text["X.COM"][1] == ["NR", "AXISPOS", "C1", "C2", "C3", "C4", "C5", "C6"]
+    degrees = [f"{np.degrees(1e-5 * k):.7f}" for k in (3, 4, 5)]
+    assert text["X.COM"][3] == ["1", "100.0000", "0.0010", "0.0020", "0.0030", *degrees]
+    assert text["Y.COM"][-2][:3] == ["1", "200.0000", "-0.0200"]
+    assert "Z.COM" not in text
 
 
 ISG = """// component errors of the X axis

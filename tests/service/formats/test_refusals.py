@@ -18,6 +18,8 @@ V = np.array([0.0, -0.010, 0.004])
 GOOD = Compensation((AxisTable("X", "X", P, V, V - 0.003),))
 TOLD = FormatSettings(reference_mm=(0.0, 0.0, 0.0))
 
+KINEMATICS = "BEGIN X.COM MM\nNR AXISPOS C1 C2 C3 C4 C5 C6\n"
+KINS = "COUNT[3] = {2, 2, 2};\nFIRST[3] = {0, 0, 0}, STEP[3] = {1, 1, 1};\nstatic const double TABLE[][3] = {\n"
 CENTROID = "CNC10 TAB FILE VERSION 3\nAXIS X\nUNITS MM\nINTERVAL 25\nENTRIES 3\n"
 MACH4 = "axis,X\nstart_mm,0\nlength_mm,10\npoints,3\npoint,position_mm,error_plus_mm,error_minus_mm\n"
 BAD_FILES = [
@@ -39,6 +41,11 @@ BAD_FILES = [
     ("fanuc-pitch", "P.TXT", "%\nN10000Q1P1.5\n%\n", r"P\.TXT:2: "),
     ("heidenhain", "X.COM", "BEGIN X.COM MM\nNR AXISPOS X\n0 0 0\n1 0 0\n[END]\n", r"X\.COM:4: position 0 after 0"),
     ("heidenhain", "X.COM", "BEGIN X.COM MM\nNR AXISPOS X\n0 0 0\n", "cut off"),
+    ("heidenhain-kinematics", "X.COM", "BEGIN X.COM MM\nNR AXISPOS X\n0 0 0\n1 9 0\n[END]\n", r"X\.COM:2: columns"),
+    ("heidenhain-kinematics", "X.COM", KINEMATICS + "0 0 0 0 0 0 0 0\n1 9 0 0\n[END]\n", r"X\.COM:4: 4 values for 8"),
+    ("linuxcnc-kins", "abbekins.c", "int main() {}\n", "COUNT, FIRST and STEP"),
+    ("linuxcnc-kins", "abbekins.c", KINS + "    {0, 0, 0},\n};\n", "1 nodes, 2 x 2 x 2 stated"),
+    ("linuxcnc-kins", "abbekins.c", KINS + "    {0, 0},\n};\n", r"abbekins\.c:4: .*three numbers"),
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,9,0,0\n", r"m\.csv:7"),
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n", "2 points, but the heading states 3: the file is cut off"),
     ("mach4", "m.csv", MACH4 + "1,0,0,0\n2,5,0,0\n3,10,0,0\n4,15,0,0\n", "4 points, but the heading states 3 -"),

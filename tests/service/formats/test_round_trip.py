@@ -12,8 +12,9 @@ from hypothesis import strategies as st
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.machine import AXES, Machine
 from abbe.service.formats import skew
+from abbe.service.formats.compare import places_mm
 from abbe.service.formats.files import FormatSettings
-from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS, Format
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [-400.0, 0.0], [-300.0, 100.0]]))
@@ -43,7 +44,7 @@ def cases(draw: st.DrawFn, form: Format) -> tuple[Compensation, FormatSettings]:
     if form.limits.lattice:
         values = rng.uniform(-size, size, (*(g.size for g in grids), 3))
         return Compensation(lattice=Lattice((grids[0], grids[1], grids[2]), values)), told
-    if form.limits.motions and draw(st.booleans()):
+    if form.limits.motions and (not form.limits.own or draw(st.booleans())):
         return Compensation(motions=_motions(rng, grids, size)), told
     pairs = [(a, o) for a in range(3) for o in range(3) if (a == o or form.limits.cross) and (a == o or draw(st.booleans()))]
     tables = tuple(
@@ -117,6 +118,10 @@ def test_nothing_differs_by_more_than_half_a_unit(key: str, data: st.DataObject)
         assert np.abs(comp.lattice.correction_mm - found.lattice.correction_mm).max() <= half
     if comp.motions is not None:
         assert found.motions is not None
+        if not found.motions.squareness_rad:  # it stands in the straightness
+            at = places_mm(comp)
+            assert np.abs(correction_at(found, at) - correction_at(comp, at)).max() <= 5 * half
+            return
         for n, c in comp.motions.curves.items():
             assert np.abs(c.value - found.motions.curves[n].value).max() <= (half if PLACES[n][1] < 3 else half * 1e-3 + 1e-12)
         assert found.motions.squareness_rad == pytest.approx(dict(comp.motions.squareness_rad), abs=half * 1e-3 + 1e-12)
