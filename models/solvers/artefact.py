@@ -12,9 +12,11 @@ Unknowns: ``pose_<setup>_x/y/z`` (mm), ``turn_<setup>_a/b/c`` (rad, artefact axe
 ``form_<artefact>_<feature>_x/y/z`` (mm, directions that were sensed), ``scale_<artefact>`` (free unless a length is calibrated),
 ``expansion_<artefact>`` (1/K, beside the stated one), ``warmth_<artefact>`` (K, of the sensor), ``twist_<artefact>_0..5`` (mm at
 the farthest feature: rotation or scale growing with r^2, bends; what clamping or springing back leaves in a workpiece),
-``cmm_<artefact>_scale/square``, ``stylus_<source>`` (mm),
+``shear_<artefact>_stretch/square`` (mm there: of the artefact, or of the
+CMM), ``cmm_<artefact>`` (its scale), ``stylus_<source>`` (mm),
 ``lobing_<direction>_x/y/z`` (mm, machine axes: touches that start in this direction against the usual one; along a wall: this direction),
-``calibration_<artefact>_<from>_<to>`` (mm).
+``clamp_<setup>_..``, ``warp_<setup>_..`` (mm at the farthest feature: bends in one pose), ``calibration_<artefact>_<from>_<to>`` (mm),
+and fine structure of the machine (`Fine`).
 
 Source: artefact-based self-calibration by reversal, Evans, Hocken and Estler, CIRP Annals 45/2 (1996) 617.
 """
@@ -34,6 +36,36 @@ from abbe.models.geometry.rotation import rotation_matrix, turn_vector, turn_vec
 Source = Literal["probe", "cmm", "length"]
 LETTERS = "xyz"
 TURNS = "abc"
+SAME_PLACE_MM = 0.5
+
+
+@dataclass(frozen=True, slots=True)
+class Fine:
+    """Fine structure of one axis' motion that no polynomial follows: an unknown in mm.
+
+    ``component``: direction that it moves; ``period_mm`` above 0: ``phase`` 0 cosine, 1 sine of the position; else a value of its own for
+    all points whose axis stands within `SAME_PLACE_MM` of ``at_mm``.
+    """
+
+    axis: int
+    component: int
+    at_mm: float = 0.0
+    period_mm: float = 0.0
+    phase: int = 0
+
+    @property
+    def name(self) -> str:
+        """``nugget_X_259.06_y`` or ``wave_X_10_x_0``."""
+        where = f"{self.period_mm:.5g}" if self.period_mm else f"{self.at_mm:.2f}"
+        end = f"_{self.phase}" if self.period_mm else ""
+        return f"{'wave' if self.period_mm else 'nugget'}_{'XYZ'[self.axis]}_{where}_{LETTERS[self.component]}{end}"
+
+    def values(self, axes_mm: F2) -> F1:
+        """Motion per unit at axis positions (n, 3)."""
+        x = axes_mm[:, self.axis]
+        if not self.period_mm:
+            return np.asarray(np.abs(x - self.at_mm) <= SAME_PLACE_MM, dtype=np.float64)
+        return np.asarray(np.sin(2.0 * np.pi * x / self.period_mm) if self.phase else np.cos(2.0 * np.pi * x / self.period_mm))
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +100,8 @@ class ArtefactPoints:
         Relative standard uncertainty of the CMM's scales and squareness.
     calibrated : bool
         Whether a length of the artefact is calibrated.
+    fine : tuple of Fine
+        Fine structure of the machine that the solution includes, the same in all runs.
     """
 
     artefact: str
@@ -88,6 +122,7 @@ class ArtefactPoints:
     far: tuple[str, ...] = ()
     far_mm: F2 = field(default_factory=lambda: np.zeros((0, 3)))
     u_mm: F1 = field(default_factory=lambda: np.zeros(0))
+    fine: tuple[Fine, ...] = ()
 
     @property
     def sign(self) -> float:
@@ -105,9 +140,12 @@ class ArtefactPriors:
     sway_mm_s : drift of the pose: 0.3 um in 10 minutes.
     form_mm : place of a feature against its nominal one; the size is estimated from the data.
     scale : of an artefact without a calibrated length.
-    twist_mm : smooth form of a workpiece; estimated from the data.
+    shear : difference of scale of the artefact's two axes and squareness: it was made by some machine.
+    twist_mm : smooth form; estimated from the data.
     stylus_mm : radius of stylus with pre-travel, or of the cutter.
     lobing_mm : estimated from the data.
+    clamp_mm, warp_mm : bend of the artefact in a pose by clamping and weight, in its plane and out of it; estimated from the data.
+    nugget_mm, wave_mm : fine structure of a machine's motion; the first is estimated from the data.
     warmth_K : offset of the temperature sensor, the same in all runs of the artefact.
     """
 
@@ -116,14 +154,19 @@ class ArtefactPriors:
     sway_mm_s: float = 5e-7
     form_mm: float = 15e-3
     scale: float = 500e-6
-    twist_mm: float = 1e-3
+    shear: float = 100e-6
+    twist_mm: float = 1.5e-3
     stylus_mm: float = 50e-3
     lobing_mm: float = 2e-3
+    clamp_mm: float = 0.5e-3
+    warp_mm: float = 1e-3
+    nugget_mm: float = 0.5e-3
+    wave_mm: float = 1.5e-3
     warmth_K: float = 0.07  # noqa: N815 - kelvin
 
 
 PRIORS = ArtefactPriors()
-LEARNED = ("sway", "form", "twist", "lobing")
+LEARNED = ("sway", "form", "twist", "lobing", "clamp", "warp", "nugget")
 """Classes of these unknowns whose typical size is estimated from the data."""
 
 
@@ -145,8 +188,12 @@ def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPrior
         out |= {f"form_{a}_{f}_{LETTERS[k]}": priors.form_mm for k, f in sorted(sensed)}
         out[f"scale_{a}"] = priors.scale
     else:
-        out |= {f"twist_{a}_{i}": priors.twist_mm for i in range(6)}
-        out |= {f"cmm_{a}_{what}": max(p.u_cmm_scale, 1e-8) for what in ("scale", "square")}
+        out[f"cmm_{a}"] = max(p.u_cmm_scale, 1e-8)
+    shear = priors.shear if p.source == "probe" else max(p.u_cmm_scale, 1e-8)
+    out |= {name: shear * p.reach_mm if "shear_" in name else priors.twist_mm for name in _shapes(p, p.nominal_mm)}
+    if p.source == "probe":
+        out |= {name: priors.warp_mm if name.startswith("warp_") else priors.clamp_mm for name in _bends(p, setup)}
+    out |= {one.name: priors.wave_mm if one.period_mm else priors.nugget_mm for one in p.fine}
     if p.normal.any():
         out[f"stylus_{p.source}"] = priors.stylus_mm
     out |= {name: priors.lobing_mm for name, _ in lobing(p)} if p.source == "probe" else {}
@@ -188,16 +235,25 @@ class Known(Protocol):
 class ArtefactReading:
     """Exact reading and derivative of the points of one run.
 
-    ``deviation_mm``: of the machine at every row, shape (n, 3); ``rows``: derivative of the deviation along given directions (n, 3) with
-    respect to terms and lost motion; ``since_s``: time since the set-up's first point.
+    ``axes_mm``, ``smooth_mm``: axis positions and deviation of the machine without fine structure, shape (n, 3); ``rows``: derivative of
+    the deviation along given directions (n, 3) with respect to terms and lost motion; ``since_s``: time since the set-up's first point.
     """
 
     points: ArtefactPoints
     setup: str
     known: Known
-    deviation_mm: F2
+    axes_mm: F2
+    smooth_mm: F2
     rows: Callable[[F2], F2]
     since_s: F1
+
+    @property
+    def deviation_mm(self) -> F2:
+        """Deviation of the machine at every row, shape (n, 3)."""
+        out = self.smooth_mm.copy()
+        for one in self.points.fine:
+            out[:, one.component] += self.known.get(one.name)[0] * one.values(self.axes_mm)
+        return out
 
     def _pose(self) -> tuple[list[str], list[str], list[str]]:
         s = self.setup
@@ -223,9 +279,17 @@ class ArtefactReading:
         if p.source == "probe":
             added = added - moved
         out = added[pick, p.component]
-        for name, column in lobing(p) if p.source == "probe" else []:
+        for name, column in self._shifts():
             out = out + self.known.get(name)[0] * column
         return np.asarray(out)
+
+    def _shifts(self) -> list[tuple[str, F1]]:
+        """Unknowns that add to the readings of a probe, with their columns: lobing, bends by clamping."""
+        p = self.points
+        if p.source != "probe":
+            return []
+        bends = _bends(p, self.setup)
+        return lobing(p) + [(name, shape[np.arange(len(shape)), p.component]) for name, shape in bends.items()]
 
     def _length(self) -> tuple[F1, F2]:
         """Calibrated length minus nominal, and the unit vectors from the first to the second feature."""
@@ -256,9 +320,9 @@ class ArtefactReading:
         parts |= {name: np.einsum("ni,ni->n", mine, slope[:, :, k]) for k, name in enumerate(turn)}
         parts |= _place_slopes(p, self.known, p.feature, p.nominal_mm, back, self.deviation_mm @ p.matrix)
         parts[f"stylus_{p.source}"] = np.einsum("ni,ni->n", mine, p.normal)
-        if p.source == "probe":
-            for name, column in lobing(p):
-                parts[name] = parts.get(name, np.zeros(n)) + column
+        for name, column in self._shifts():
+            parts[name] = parts.get(name, np.zeros(n)) + column
+        parts |= {one.name: direction[:, one.component] * one.values(self.axes_mm) for one in p.fine}
         return np.concatenate([self.rows(direction), self.known.columns(parts, n)], axis=1)
 
     def _length_jacobian(self) -> F2:
@@ -274,14 +338,12 @@ class ArtefactReading:
 
 def _place(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nominal_mm: F2) -> tuple[F2, F1]:
     """Place of features on the true artefact, (n, 3), and 1 + scale and expansion, (n,)."""
+    shapes = _shapes(p, nominal_mm)
     form = np.array([known.get(*(f"form_{p.artefact}_{f}_{k}" for k in LETTERS)) for f in feature]).reshape(-1, 3)
-    twist = known.get(*(f"twist_{p.artefact}_{i}" for i in range(6)))
-    form = form + np.einsum("k,knj->nj", twist, _twists(p, nominal_mm))
-    names = (f"scale_{p.artefact}", f"cmm_{p.artefact}_scale", f"cmm_{p.artefact}_square")
-    scale, cmm, square = known.get(*names)
+    form = form + np.einsum("k,knj->nj", known.get(*shapes), np.array(list(shapes.values())))
+    scale, cmm = known.get(f"scale_{p.artefact}", f"cmm_{p.artefact}")
     expansion, warmer = _expansion(p, known)
     factor = 1.0 + scale + cmm + warmer * expansion
-    form[:, 0] += square * nominal_mm[:, 1]
     return factor[:, None] * nominal_mm + form, np.asarray(factor)
 
 
@@ -299,27 +361,32 @@ def _place_slopes(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nom
         for k in range(3):
             out.setdefault(f"form_{p.artefact}_{f}_{LETTERS[k]}", np.zeros(len(feature)))[i] += back[i, k]
     along = np.einsum("ni,ni->n", back, nominal_mm + (moved if p.source == "cmm" else 0.0))
-    for i, shape in enumerate(_twists(p, nominal_mm)):
-        out[f"twist_{p.artefact}_{i}"] = np.einsum("ni,ni->n", back, shape)
-    out[f"scale_{p.artefact}"] = out[f"cmm_{p.artefact}_scale"] = along
+    out |= {name: np.einsum("ni,ni->n", back, shape) for name, shape in _shapes(p, nominal_mm).items()}
+    out[f"scale_{p.artefact}"] = out[f"cmm_{p.artefact}"] = along
     expansion, warmer = _expansion(p, known)
     out[f"expansion_{p.artefact}"] = along * warmer
     out[f"warmth_{p.artefact}"] = along * expansion * {"probe": 1.0, "cmm": -1.0, "length": 0.0}[p.source]
-    out[f"cmm_{p.artefact}_square"] = back[:, 0] * nominal_mm[:, 1]
     return out
 
 
-def _twists(p: ArtefactPoints, nominal_mm: F2) -> NDArray[np.float64]:
-    """Smooth forms in the plane of the artefact, 1 at its farthest feature, shape (6, n, 3): swirl and barrel (r^2), curves, trapezia."""
+def _bends(p: ArtefactPoints, setup: str) -> dict[str, F2]:
+    """Bends of second degree of an artefact in one pose, 1 at its farthest feature, shape (n, 3): in its plane, and out of it (warp)."""
+    x, y, _ = ((p.nominal_mm - p.middle_mm) / p.reach_mm).T
+    out = {}
+    for i, value in enumerate((x * x, x * y, y * y)):
+        if np.ptp(value) > 0.0:
+            for k in np.unique(p.component):
+                shape = np.zeros((len(x), 3))
+                shape[:, k] = value
+                out[f"{'warp' if k == 2 else 'clamp'}_{setup}_{LETTERS[k]}{i}"] = shape
+    return out
+
+
+def _shapes(p: ArtefactPoints, nominal_mm: F2) -> dict[str, F2]:
+    """Smooth forms in the artefact's plane by unknown, 1 at its farthest feature, shape (n, 3): stretch, shear, swirl, barrel, bends."""
     x, y, _ = ((nominal_mm - p.middle_mm) / p.reach_mm).T
     r2, none = x * x + y * y, np.zeros(len(x))
-    return np.array(
-        [
-            np.stack([-y * r2, x * r2, none], 1),
-            np.stack([x * r2, y * r2, none], 1),
-            np.stack([x * x, none, none], 1),
-            np.stack([none, y * y, none], 1),
-            np.stack([x * y, none, none], 1),
-            np.stack([none, x * y, none], 1),
-        ]
-    )
+    linear = {f"shear_{p.artefact}_stretch": (x, -y), f"shear_{p.artefact}_square": (y, x)}
+    bends = ((-y * r2, x * r2), (x * r2, y * r2), (x * x, none), (none, y * y), (x * y, none), (none, x * y))
+    shapes = linear | {f"twist_{p.artefact}_{i}": bend for i, bend in enumerate(bends)}
+    return {name: np.stack([*at, none], axis=1) for name, at in shapes.items()}

@@ -8,7 +8,7 @@ noise of the instruments and the size of each class of errors are estimated as w
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import wraps
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
@@ -191,6 +191,8 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         raise ValueError("joint solution: no runs")
     report = progress or _silent
     noise = expected_noise(runs, sigma_mm, floor_mm)
+    if all(run.kind == "artefact" for run in runs):
+        priors = replace(priors or Priors(), pooled=True)
     terms = _six() if model == "rigid6" else smooth_terms(order or SMOOTH_ORDER)
     problem = build(machine, terms, runs, priors or Priors(), noise)
     fit = settle(problem, report)

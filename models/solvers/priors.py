@@ -48,6 +48,7 @@ class Priors:
         direction, 0.3 mm in 1 m) and a mirror tilted by t (``tilt_rad``): rms 0.25e-6, on 1 m as much as the noise of the reading.
     bar_drift_mm_s : drift of the tool against the cup in each direction during a ball-bar set-up: 0.18 um/min or 11 um/h, an assumption
         for a machine that is neither cold nor settled.
+    pooled : whether the size of the whole machine, scales and squareness included, is estimated too (artefacts: few readings).
     """
 
     scale_rad: float = 100e-6
@@ -68,6 +69,7 @@ class Priors:
     laser_scale: float = U_WAVELENGTH
     cosine: float = 0.25e-6
     bar_drift_mm_s: float = 3e-6
+    pooled: bool = False
 
 
 def bar_length_sd(u_length_mm: float | None, calibrated: bool | None, priors: Priors) -> float:
@@ -231,7 +233,9 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
     """
     kinds = [_class(t) for t in terms] + [_setup_class(n) for n in rest]
     motion = np.array([t.motion if 2 <= t.order <= SMOOTH_ORDER else "" for t in terms] + [""] * len(rest))
-    numbers = _classes(kinds) + _motions(motion, np.array([t.order for t in terms] + [0] * len(rest)))
+    whole = np.arange(motion.size) < len(terms)
+    numbers = [_Number("machine", whole.astype(np.float64), MACHINE_SIZE)] if priors.pooled else []
+    numbers += _classes(kinds) + _motions(motion, np.array([t.order for t in terms] + [0] * len(rest)))
     design = np.array([n.column for n in numbers]).reshape(len(numbers), motion.size).T
     sd, low, high = np.array([n.bounds for n in numbers]).reshape(-1, 3).T
     blocks = tuple(np.flatnonzero(motion == m) for m in dict.fromkeys(motion) if m)
@@ -239,6 +243,10 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
     typical = np.concatenate([_reference(machine, terms, priors), rest_sd])
     names = tuple(n.name for n in numbers)
     return with_length(SizeModel(typical, root, blocks, rough, FIRST_LENGTH, names, design, sd, low, high), FIRST_LENGTH)
+
+
+MACHINE_SIZE = (2.0 * np.log(5.0), -2.0 * np.log(40.0), 2.0 * np.log(5.0))
+"""Hyperprior and bounds of the size of a whole machine (`Priors.pooled`): from small ones of 0.3 um to bad ones."""
 
 
 class _Number(NamedTuple):
