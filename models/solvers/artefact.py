@@ -44,7 +44,7 @@ class Fine:
     """Fine structure of one axis' motion that no polynomial follows: an unknown in mm.
 
     ``component``: direction that it moves; ``period_mm`` above 0: ``phase`` 0 cosine, 1 sine of the position; else a value of its own for
-    all points whose axis stands within `SAME_PLACE_MM` of ``at_mm``.
+    all points whose axis stands within `SAME_PLACE_MM` of ``at_mm``. ``size_mm``: prior standard deviation; 0: the usual one.
     """
 
     axis: int
@@ -52,6 +52,7 @@ class Fine:
     at_mm: float = 0.0
     period_mm: float = 0.0
     phase: int = 0
+    size_mm: float = 0.0
 
     @property
     def name(self) -> str:
@@ -193,7 +194,7 @@ def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPrior
     out |= {name: shear * p.reach_mm if "shear_" in name else priors.twist_mm for name in _shapes(p, p.nominal_mm)}
     if p.source == "probe":
         out |= {name: priors.warp_mm if name.startswith("warp_") else priors.clamp_mm for name in _bends(p, setup)}
-    out |= {one.name: priors.wave_mm if one.period_mm else priors.nugget_mm for one in p.fine}
+    out |= {one.name: one.size_mm or priors.nugget_mm for one in p.fine}
     if p.normal.any():
         out[f"stylus_{p.source}"] = priors.stylus_mm
     out |= {name: priors.lobing_mm for name, _ in lobing(p)} if p.source == "probe" else {}

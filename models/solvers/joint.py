@@ -20,7 +20,17 @@ from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term, rough_ter
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.components import KINDS, RIGID6, OrderChoice, choose, term_levels, total
-from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Progress, build, expected_noise, rough_evidence, settle
+from abbe.models.solvers.engine import (
+    CampaignFit,
+    CampaignProblem,
+    InstrumentNoise,
+    Progress,
+    build,
+    expected_noise,
+    rough_evidence,
+    settle,
+)
+from abbe.models.solvers.fine import refined
 from abbe.models.solvers.least_squares import Identifiability, ParameterEstimate, combinations_of, taking_part
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, hidden_free, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
@@ -28,8 +38,9 @@ from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
-ROUGH_EVIDENCE = 5.0
-"""Motions are solved for with their rough parts if the score for these exceeds its expectation by so many standard deviations."""
+ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, 2.0
+"""Motions are solved for with their rough parts if the score for these exceeds its expectation by so many standard deviations;
+points of artefacts are few, so less is enough."""
 Model = Literal["rigid6", "rigid21", "auto"]
 
 
@@ -198,11 +209,13 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     fit = settle(problem, report)
     if model == "rigid6":
         return _solution(problem, fit, "rigid6", 1, None)
-    if order is None and rough_evidence(problem, fit, rough_terms()) > ROUGH_EVIDENCE:
+    points = all(run.kind == "artefact" for run in runs)
+    if order is None and points:
+        problem, fit = refined(problem, fit, lambda fine: _again(machine, terms, fine, priors or Priors(), noise, report))
+    if order is None and rough_evidence(problem, fit, rough_terms()) > (ROUGH_POINTS if points else ROUGH_EVIDENCE):
         report("the readings show error motions that are rough")
         terms = (*terms, *rough_terms())
-        problem = build(machine, terms, runs, priors or Priors(), noise)
-        fit = settle(problem, report)
+        problem, fit = _again(machine, terms, problem.runs, priors or Priors(), noise, report)
     choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
         report("held-out runs support only scales and squareness")
@@ -211,6 +224,13 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     chosen = order or max(choice.chosen, 1)
     report(f"order {chosen}" + ("" if order else " chosen by held-out runs"))
     return _solution(problem, fit, "rigid21", chosen, None if order else choice)
+
+
+def _again(
+    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: InstrumentNoise, report: Progress
+) -> tuple[CampaignProblem, CampaignFit]:
+    problem = build(machine, terms, runs, priors, noise)
+    return problem, settle(problem, report)
 
 
 def _silent(_: str) -> None:

@@ -7,6 +7,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.chain import design
 from abbe.models.machine import with_tool
+from abbe.models.solvers.artefact import Fine
 from abbe.models.solvers.joint import JointSolution
 
 SENSED = 1e-3
@@ -38,18 +39,34 @@ def unsensed_axis(joint: JointSolution) -> int | None:
 def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2, str]:
     """Return deviation and expanded uncertainty (k = 2) at points, mm, shape (n, 3) each, NaN where not sensed, and the frame in words."""
     tool = next(run.tool_mm for run in joint.data if run.points is not None and run.points.source != "length")
-    at = design(with_tool(joint.machine, tool), joint.terms, points_mm)
+    at, chosen = design(with_tool(joint.machine, tool), joint.terms, points_mm), np.arange(len(joint.terms))
+    waves, scatter_mm = _fine(joint)
+    names = joint.estimate.names
+    if waves:
+        chosen = np.concatenate([chosen, [names.index(w.name) for w in waves]])
+        at = np.concatenate([at, np.stack([np.outer(w.values(points_mm), np.eye(3)[w.component]) for w in waves], axis=2)], axis=2)
     axis, free = unsensed_axis(joint), without_length(joint)
     keep = [k for k in range(3) if k != axis]
-    rows = at[:, keep].reshape(-1, len(joint.terms))
+    rows = at[:, keep].reshape(-1, len(chosen))
     basis, _ = np.linalg.qr(_frame(points_mm, keep, scale=free))
     rows = rows - basis @ (basis.T @ rows)
-    u: F1 = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, joint.term_covariance, rows), 0.0))
+    covariance = joint.estimate.covariance[np.ix_(chosen, chosen)]
+    u: F1 = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, covariance, rows), 0.0))
     deviation, expanded = np.full((2, len(points_mm), 3), np.nan)
-    deviation[:, keep] = (rows @ joint.coefficients).reshape(-1, len(keep))
-    expanded[:, keep] = COVERAGE * u.reshape(-1, len(keep))
+    deviation[:, keep] = (rows @ joint.estimate.theta[chosen]).reshape(-1, len(keep))
+    expanded[:, keep] = COVERAGE * np.hypot(u.reshape(-1, len(keep)), scatter_mm[keep])
     plane, scale = (" in the plane", NOT_SENSED) if axis is not None else ("", ""), (" and common scale", NO_LENGTH) if free else ("", "")
     return deviation, expanded, MOTION.format(plane=plane[0], scale=scale[0]) + scale[1] + plane[1]
+
+
+def _fine(joint: JointSolution) -> tuple[tuple[Fine, ...], F1]:
+    """Return the waves of the machine's motions, and for each direction what changes from one position to the next, mm."""
+    fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
+    scatter = np.zeros(3)
+    for one in fine:
+        if not one.period_mm:
+            scatter[one.component] = joint.prior_sd[joint.estimate.names.index(one.name)]
+    return tuple(one for one in fine if one.period_mm), scatter
 
 
 def _frame(points_mm: F2, keep: list[int], *, scale: bool) -> F2:
