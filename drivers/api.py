@@ -161,6 +161,8 @@ class BankState(StrEnum):
     SEALED = "sealed"
     LAID_ASIDE = "laid aside"
     """Sealed, and takes effect after the control's next start."""
+    OFF = "switched off"
+    """Compensation is off, so the table does not act (controls with one table, `OneBank`)."""
     UNKNOWN = "unknown"
     """The controller reports a number that its driver does not know."""
 
@@ -255,12 +257,41 @@ class Tables(Protocol):
     async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None: ...
 
 
+class TableState(NamedTuple):
+    """State of a control with one table. ``acts``: compensation is on."""
+
+    boot_id: int
+    acts: bool
+
+
+class OneBank(Protocol):
+    """A control with one table, which acts while its compensation is on. The table is an image (`abbe.drivers.tables`).
+
+    ``write_table``: Refused while the table acts. ``switch``: numbered, so that a late or repeated request does nothing; Refused if the
+    CRC-32 of the control's image is not ``expect_crc``, or if it is switched so already. Compensation that is off stays off over a restart.
+    """
+
+    async def status(self) -> ControllerStatus: ...
+    async def table_state(self) -> TableState: ...
+    async def read_table(self) -> bytes: ...
+    async def write_table(self, data: bytes, *, first: int) -> None: ...
+    async def switch(self, *, on: bool, expect_crc: int) -> None: ...
+
+
 class TableController(Identity, Tables, Protocol):
     """The part of a controller that writing compensation tables needs: status and banks, but no motion."""
 
 
 class Controller(Identity, Paths, Tables, Protocol):
     """All capabilities of a controller. Functions should require only the part that they need."""
+
+
+ONE_BANK = ("table_state", "read_table", "write_table", "switch")
+
+
+def has_one_table(controller: object) -> bool:
+    """Whether a control has one table in place of two banks (`OneBank`)."""
+    return all(hasattr(controller, name) for name in ONE_BANK)
 
 
 def only_listens(controller: Identity | Motion) -> bool:

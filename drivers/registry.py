@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from importlib.metadata import EntryPoint
 from typing import cast
 
-from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture
+from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture, OneBank, Tables, has_one_table
 from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.described.control import ListenedControl
@@ -35,6 +35,7 @@ from abbe.drivers.links.urls import (
     installed,
     parse_url,
 )
+from abbe.drivers.one_bank import OneBankTables
 
 HEARTBEAT_S = 1.0
 """Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
@@ -98,7 +99,8 @@ async def open_controller(url: str) -> Controller:
         Communication failed.
     """
     if (entry := installed(url)) is not None:
-        controller = cast(Controller, await _opened(entry, "cnc", url))
+        found = cast(Controller, await _opened(entry, "cnc", url))
+        controller = cast(Controller, OneBankTables(cast(OneBank, found))) if has_one_table(found) else found
     elif described_by(parsed := parse_url(url)):
         return await open_control(parsed, needed=Ability.DWELL)
     else:
@@ -149,7 +151,10 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
     if not isinstance(driver, Mapping) or not callable(driver.get(role)):
         raise BadUrl(ascii(url), "open device", f"the driver {entry.value} opens no {role}", "is this the right device for this key?")
     device = await driver[role](url)
-    missing = sorted(name for name in dir(ROLES[role]) if name[0] != "_" and not hasattr(device, name))
+    needed = {name for name in dir(ROLES[role]) if name[0] != "_"}
+    if role == "cnc" and has_one_table(device):
+        needed -= {name for name in (*dir(Tables), "comp_status") if name[0] != "_"}
+    missing = sorted(name for name in needed if not hasattr(device, name))
     if missing:
         if hasattr(device, "close"):
             await device.close()

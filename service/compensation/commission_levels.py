@@ -16,14 +16,14 @@ from collections.abc import Awaitable
 from contextlib import suppress
 from dataclasses import dataclass, field, fields
 
-from abbe.drivers.api import BankState, CompStatus, Controller, ControllerStatus, Point
+from abbe.drivers.api import BankState, CompStatus, Controller, ControllerStatus, Point, has_one_table
 from abbe.drivers.errors import DeviceFault, Refused, run_to_end
 from abbe.models.machine import AXES
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.proved_levels import KIND, flags_of, identity, last_proof
 from abbe.service.compensation.recover import recover
 from abbe.service.domain.document import Doc
-from abbe.service.errors import TableMismatch, UnsafeToMove
+from abbe.service.errors import TableMismatch, TableRefused, UnsafeToMove
 from abbe.service.push.limits import Capabilities
 from abbe.service.sequences.control import tripped
 from abbe.service.site import Site
@@ -239,8 +239,8 @@ class ProvedLevels:
 
     def rows(self) -> list[tuple[str, bool, str]]:
         """Return for each flag its name, whether it is proved, and the observations for or against it as text."""
-        found = flags_of(self.capabilities)
-        return [(name, ok, how(self.shown, name)) for name, ok in found.items() if name != "can_disable"]
+        found, one_table = flags_of(self.capabilities), any(s.flag == "can_disable" for s in self.shown)
+        return [(name, ok, how(self.shown, name)) for name, ok in found.items() if (name == "can_disable") is one_table]
 
 
 async def commission_levels(controller: Controller, store: Store, site: Site, clock: Clock | None = None) -> ProvedLevels:
@@ -248,6 +248,8 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
 
     Raises
     ------
+    TableRefused
+        The control has one table: `commission_one_bank`.
     UnsafeToMove
         Another owner has the lease of the banks, or a push is under way.
     StillActive
@@ -259,6 +261,11 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     """
     await recover(controller, store, site)  # the inactive bank may hold the table that an interrupted push rolls back to
     info = await controller.identify()
+    if has_one_table(controller):
+        raise TableRefused(
+            "this control has one table, not two banks: while tables are exchanged nothing acts, and no other program may write",
+            "if that is acceptable, commission that lower level by name: abbe comp commission --one-bank",
+        )
     base = await read_base(controller)
     if base.status.lease_owner:
         raise UnsafeToMove("another owner has the lease of the banks", "wait until it has run out, then begin again")
@@ -279,7 +286,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
         "identity": identity(info), "boot_id": info.boot_id, "flags": flags_of(capabilities), "level": capabilities.level,
         "shown": [[s.flag, s.ok, s.what] for s in trial.shown], "not_shown": list(not_shown),
     }  # fmt: skip
-    solution_id = await store.write(_keep, store, site, doc)
+    solution_id = await store.write(keep_proof, store, site, doc)
     return ProvedLevels(capabilities, tuple(trial.shown), not_shown, identity(info), solution_id)
 
 
@@ -289,7 +296,8 @@ def how(shown: tuple[Observation, ...], flag: str) -> str:
     return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "not tried"
 
 
-def _keep(store: Store, site: Site, doc: Doc) -> int:
+def keep_proof(store: Store, site: Site, doc: Doc) -> int:
+    """Store the document of a commissioning; return its number."""
     machine_id = store.machines.add(site.name, site.doc)
     number = sum(c.name.startswith(f"{KIND} ") for c in store.campaigns.all()) + 1
     return store.solutions.add(store.campaigns.add(machine_id, f"{KIND} {number}", {}), KIND, [], doc)

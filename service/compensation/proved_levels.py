@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 from dataclasses import asdict, dataclass, fields
 
-from abbe.drivers.api import BankState, DeviceInfo, Identity
+from abbe.drivers.api import BankState, DeviceInfo, Identity, has_one_table
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import Capabilities, objection
@@ -18,6 +18,10 @@ from abbe.service.storage.store import Store
 
 KIND = "levels"
 HINT = "this controller's capabilities for a safe push were never proved{}: run abbe comp commission; until then a person has to attend"
+ONE_TABLE = (
+    "this control has one table, and the lower level that it can have was never commissioned{}: abbe comp commission --one-bank; "
+    "until then nothing is written into it"
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,11 +60,17 @@ async def level_status(controller: Identity, store: Store, site: Site) -> LevelS
     doc = await asyncio.to_thread(last_proof, store, site)
     if doc is not None and doc["identity"] == identity(info):
         return LevelStatus(Capabilities(**{f.name: doc["flags"].get(f.name) is True for f in fields(Capabilities)}), "")
-    return LevelStatus(await _visible(controller), HINT.format("" if doc is None else " since the controller or its firmware was replaced"))
+    hint = ONE_TABLE if has_one_table(controller) else HINT
+    return LevelStatus(await _visible(controller), hint.format("" if doc is None else " since the controller or its firmware was replaced"))
 
 
 async def _visible(controller: Identity) -> Capabilities:
-    """What the status block shows without a test: two banks, a generation, a boot id. None of it is proved."""
+    """What the status block shows without a test: two banks, a generation, a boot id. None of it is proved.
+
+    A control with one table shows nothing: its level is only ever given by name (`abbe comp commission --one-bank`).
+    """
+    if has_one_table(controller):
+        return Capabilities()
     now = await controller.comp_status()
     banks = now.active_bank in (0, 1) and now.bank_state[now.active_bank] is not BankState.EMPTY
     return Capabilities(two_banks=banks, generation=now.gen != 0, boot_id=now.boot_id != 0)

@@ -38,7 +38,9 @@ def record(state: PushState, **doc: object) -> Operation:
 
 
 def in_force(f: PushFacts, truth: Truth) -> str:
-    """Which table is active by the reported CRC: ``"base"`` (the old one), ``"candidate"`` (the new one) or ``"neither"``."""
+    """Which table acts by the reported CRC: ``"base"`` (the old one), ``"candidate"`` (the new one), ``"neither"``; or ``"off"``: none."""
+    if truth.states[truth.active] is BankState.OFF:
+        return "off"
     crc = truth.crc[truth.active]
     if truth.states[truth.active] is BankState.SEALED and crc in (f.base_crc, f.crc):
         return "base" if crc == f.base_crc else "candidate"
@@ -86,7 +88,7 @@ def _arrived(f: PushFacts, known: Knowledge) -> Operation:
 
 
 def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
-    """The new table is active: replace it by the old one."""
+    """The new table is active, or an exchange was interrupted and none acts: bring the old one back."""
     truth = known.start
     assert truth is not None
     if truth.unsafe:
@@ -106,7 +108,7 @@ def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Opera
         return _lease(f, known, truth, state, seq)
     if state is PushState.RESTAGING:
         return _restage(f, known, truth, state)
-    return _with_old_bank(f, known, truth)
+    return _with_table_off(f, known, truth) if in_force(f, truth) == "off" else _with_old_bank(f, known, truth)
 
 
 def _lease_open(f: PushFacts, truth: Truth) -> bool:
@@ -151,6 +153,26 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
     )
 
 
+def _with_table_off(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+    """A control with one table was interrupted while tables were exchanged: restore the old one, unless its table holds foreign content."""
+    step = bracket(known, truth.active, min(len(f.image), len(f.base_image)) // 2, again=False)
+    if isinstance(step, Operation):
+        return step
+    if step is not None and _mixed(known.image or b"", (f.image, f.base_image), 2 * f.chunk_words):
+        return _begin_restaging(step.truth, 1 - truth.active)
+    if known.brackets < BRACKETS:
+        return Operation(OperationKind.LOOK, mark=True)
+    why = "compensation is off, and its table was changed by another program or a person"
+    return record(PushState.OPERATOR, why=why, **mismatch_doc(f, truth))
+
+
+def _mixed(content: bytes, images: tuple[bytes, bytes], size: int) -> bool:
+    """Whether each chunk of a table is that of the new or of the old one."""
+    return bool(content) and all(
+        content[at : at + size] in [i[: len(content)][at : at + size] for i in images] for at in range(0, len(content), size)
+    )
+
+
 def _armed(truth: Truth, bank: int, state: PushState) -> Operation:
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
@@ -171,10 +193,12 @@ def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> 
     if not known.wrote_last:  # the progress of an earlier process is unknown: restart with the present generation
         return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(
-        f.back_bank, f.base_image, f.base_crc, f.base_semantic_digest, known.lease,
-        f.restage_gen, f.restage_boot, f.crc, f.chunk_words,
+        f.back_bank, f.base_image, f.base_crc, "", known.lease,
+        f.restage_gen, f.restage_boot, f.crc if in_force(f, truth) != "off" else 0, f.chunk_words,
     )  # fmt: skip
     step = stage(image, known)
+    if isinstance(step, Coherent) and in_force(f, step.truth) == "off" and step.truth.gen != f.restage_gen:
+        return record(PushState.ROLLBACK, again="the table that is switched off was changed meanwhile")
     if isinstance(step, Coherent):
         return _armed(step.truth, image.bank, state)
     if isinstance(step, Failed):

@@ -66,11 +66,12 @@ class Capabilities:
     """The controller itself refuses an activation while the machine moves or an interlock is open."""
     lease: bool = False
     can_disable: bool = False
-    """With one bank only: compensation can be switched off, and the controller confirms that the drives are off."""
+    """With one table only (`abbe.drivers.api.OneBank`), proved by ``abbe comp commission --one-bank``: the control refuses writes while the
+    table acts, and a switch with a wrong CRC; switched off, it says so."""
 
     @property
     def level(self) -> int:
-        """Allowed pushes. 3: unattended; 2: attended; 1: attended with drives off; 0: none, the controller can only be read."""
+        """Allowed pushes. 3: unattended; 2: attended; 1: attended, one table; 0: none, the controller can only be read."""
         flags = [getattr(self, f.name) for f in fields(self) if f.name != "can_disable"]
         if all(flags):
             return 3
@@ -88,8 +89,6 @@ def objection(level: int, *, attended: bool) -> str:
     """Why a push is not allowed at this level; empty if it is."""
     if level >= 3:
         return ""
-    if level == 2:
+    if level in (1, 2):
         return "" if attended else NEEDS_ATTENDANCE
-    if level == 1:
-        return "this controller has one bank: pushes with drives off are not built yet; export the table as a file"
     return "this controller can only be read: export the table as a file"

@@ -237,4 +237,4 @@ def violations(world: Any, ended: Any, again: Any, *, idempotent: bool) -> list[
     """Names of the invariants that do not hold."""
     world.idempotent = idempotent and (again is None or ended is None or again.state == ended.state)
     world.settled = ended is not None and ended.settled
-    return [name for name, check in CHECKS.items() if not check(world)]
+    return [name for name, check in world.checks.items() if not check(world)]

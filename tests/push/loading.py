@@ -11,7 +11,7 @@ from types import ModuleType, SimpleNamespace
 ROOT = Path(__file__).resolve().parents[2]
 NAMES = ("journal", "operations", "limits", "validate", "back", "machine", "execute")
 """In the order of their imports."""
-OUTSIDE = {"second_decoder": "drivers/second_decoder.py", "codec": "service/tables/nine_tables.py"}
+OUTSIDE = {"second_decoder": "drivers/second_decoder.py", "one_bank": "drivers/one_bank.py", "codec": "service/tables/nine_tables.py"}
 _counter = itertools.count()
 
 Edits = tuple[tuple[str, str, str], ...]
@@ -21,7 +21,7 @@ Edits = tuple[tuple[str, str, str], ...]
 def real() -> SimpleNamespace:
     """The modules as they are."""
     found = {name: import_module(f"abbe.service.push.{name}") for name in NAMES}
-    return SimpleNamespace(**found, codec=import_module("abbe.service.tables.nine_tables"))
+    return SimpleNamespace(**found, codec=import_module("abbe.service.tables.nine_tables"), one_bank=import_module("abbe.drivers.one_bank"))
 
 
 def edited(edits: Edits) -> SimpleNamespace:
@@ -34,7 +34,7 @@ def edited(edits: Edits) -> SimpleNamespace:
         assert sources[module].count(old) == 1, f"{module}: {sources[module].count(old)} times: {old!r}"
         sources[module] = sources[module].replace(old, new)
     made = {}
-    for name in ("second_decoder", *NAMES, "codec"):
+    for name in ("second_decoder", *NAMES, "codec", "one_bank"):
         text = (
             sources[name].replace("abbe.service.push.", f"{package}.").replace("abbe.drivers.second_decoder", f"{package}.second_decoder")
         )

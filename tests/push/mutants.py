@@ -10,7 +10,7 @@ LOOKS_SAFE = ("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe
 MUTANTS: dict[str, Edits] = {
     "second read-back skipped": (
         ("operations", "step = bracket(known, image.bank, words, again=True)", "step = bracket(known, image.bank, words, again=False)"),
-        ("operations", "known.image != image.data or known.decoded_digest != image.semantic_digest:", "known.image != image.data:"),
+        ("operations", "known.image != image.data or (image.semantic_digest and known.decoded_digest != image.semantic_digest):", "known.image != image.data:"),
     ),
     "full read-back skipped": (
         (
@@ -18,7 +18,7 @@ MUTANTS: dict[str, Edits] = {
             "step = bracket(known, image.bank, words, again=True)",
             "step = Operation(OperationKind.LOOK) if known.truth is None else Coherent(known.truth)",
         ),
-        ("operations", "if known.image != image.data or known.decoded_digest != image.semantic_digest:", "if False:"),
+        ("operations", "if known.image != image.data or (image.semantic_digest and known.decoded_digest != image.semantic_digest):", "if False:"),
     ),
     "journal after the action": (
         (

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from types import SimpleNamespace
 
+from tests.push.one_bank import OneBankWorld
 from tests.push.world import FAULTS, Case, World
 
 CASES = (
@@ -60,8 +61,13 @@ def faults_of(kinds: list[str], first: int) -> Iterator[tuple[int, str]]:
             yield n, fault
 
 
+def world_of(protocol: SimpleNamespace, case: Case, plan: Plan) -> World:
+    """The world of a case: one with one table at level 1, else one with two banks."""
+    return OneBankWorld(protocol, case, plan) if case.level == 1 else World(protocol, case, plan)
+
+
 def run(protocol: SimpleNamespace, case: Case, plan: Plan, count: Count) -> World:
-    world = World(protocol, case, plan)
+    world = world_of(protocol, case, plan)
     count.add(case, plan, world, [*world.run(), *_expected(case, plan, world)])
     return world
 
@@ -69,7 +75,9 @@ def run(protocol: SimpleNamespace, case: Case, plan: Plan, count: Count) -> Worl
 def _expected(case: Case, plan: Plan, world: World) -> list[str]:
     """Without a fault it ends as it should; one bit that flips on the way is written or read again, and changes nothing."""
     harmless = all(fault.startswith("flip") for fault in plan.values()) and len(plan) < 2
-    return ["END"] if harmless and (not world.journal or str(world.journal[-1].state) != case.end) else []
+    # The one table of a control has no generation that tells our own spoilt word from a person's: nobody overwrites it.
+    ends = {case.end, "OPERATOR"} if case.level == 1 and "flip_write" in plan.values() else {case.end}
+    return ["END"] if harmless and (not world.journal or str(world.journal[-1].state) not in ends) else []
 
 
 def singles(protocol: SimpleNamespace, cases: tuple[Case, ...] = CASES) -> Count:
@@ -95,11 +103,11 @@ def doubles(
     ``every`` k: each k-th pair. ``part`` (a, b): only first faults a, a + b, ... to share the work.
     """
     count, pair = Count(), 0
-    kinds = World(protocol, case, {}).kinds_of_run()
+    kinds = world_of(protocol, case, {}).kinds_of_run()
     for number, (n, fault) in enumerate(faults_of(kinds, 0)):
         if number % part[1] != part[0]:
             continue
-        seconds = World(protocol, case, {n: fault}).kinds_of_run()
+        seconds = world_of(protocol, case, {n: fault}).kinds_of_run()
         for m, second in faults_of(seconds, n + 1):
             pair += 1
             if pair % every == 0:
@@ -108,19 +116,19 @@ def doubles(
     return count
 
 
-def first_violation(protocol: SimpleNamespace) -> str:
+def first_violation(protocol: SimpleNamespace, cases: tuple[Case, ...] = CASES) -> str:
     """The first thing that a sweep over single faults of all cases finds; empty if it finds nothing. Coarse first, then in full."""
-    for case in CASES:
+    for case in cases:
         found = _look(protocol, case, 0, 9)
         if found:
             return found
-    return next((found for rest in range(1, 9) for case in CASES if (found := _look(protocol, case, rest, 9))), "")
+    return next((found for rest in range(1, 9) for case in cases if (found := _look(protocol, case, rest, 9))), "")
 
 
 def _look(protocol: SimpleNamespace, case: Case, rest: int, step: int) -> str:
     count = Count()
     plans: list[Plan] = [{}] if rest == 0 else []
-    kinds = World(protocol, case, {}).kinds_of_run()
+    kinds = world_of(protocol, case, {}).kinds_of_run()
     plans += [{n: fault} for k, (n, fault) in enumerate(faults_of(kinds, 0)) if k % step == rest]
     for plan in plans:
         run(protocol, case, plan, count)

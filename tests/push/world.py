@@ -10,7 +10,7 @@ from typing import Any
 from abbe.service.domain.document import GENESIS
 from tests.push import controller as c
 from tests.push.content import images, meanings, tables
-from tests.push.invariants import violations
+from tests.push.invariants import CHECKS, violations
 
 HOST = ("crash_before", "crash_after")
 WORLD = (
@@ -73,6 +73,8 @@ class Case:
 
 class World:
     """One controller, one journal, one process at a time; ``plan`` says which operation goes wrong how."""
+
+    checks = CHECKS
 
     def __init__(self, protocol: SimpleNamespace, case: Case, plan: dict[int, str]) -> None:
         self.p, self.case, self.plan = protocol, case, plan

@@ -155,13 +155,22 @@ def accept_table(
     conclude(measure_now(loaded.path), as_json=as_json)
 
 
-ALLOWED = {3: "unattended pushes", 2: "pushes that a person attends", 1: "no push", 0: "no push: read and export only"}
+ALLOWED = {
+    3: "unattended pushes",
+    2: "pushes that a person attends",
+    1: "attended pushes, nothing acts while tables are exchanged",
+    0: "no push: read and export only",
+}
 
 
 def commission(
     levels_only: Annotated[
         bool,
         typer.Option("--levels-only", help="Only prove the controller's level for pushes: one move of 3 mm, nothing is mounted."),
+    ] = False,
+    one_bank: Annotated[
+        bool,
+        typer.Option("--one-bank", help="The control has one table; I accept the lower level: nothing acts while tables are exchanged."),
     ] = False,
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
@@ -177,6 +186,7 @@ def commission(
     from abbe.service.cli.running import display, rollback_when_safe, run_job
     from abbe.service.compensation.commission import commission as work_commission
     from abbe.service.compensation.commission_levels import commission_levels
+    from abbe.service.compensation.commission_one_bank import commission_one_bank
     from abbe.service.compensation.proved_levels import check_level
     from abbe.service.config import load_machine
     from abbe.service.site import site_of
@@ -187,7 +197,7 @@ def commission(
 
     async def work(store: Store) -> tuple[ProvedLevels, SignCommissioning | None]:
         async with ready_session(store, site, accept_table=accept_table) as session:
-            levels = await commission_levels(session.controller, store, site)
+            levels = await (commission_one_bank if one_bank else commission_levels)(session.controller, store, site)
             if not as_json:
                 _show_levels(levels)
             if levels_only:
@@ -203,7 +213,7 @@ def commission(
         print_json({"levels": _levels_doc(levels)} | (_proof_doc(found) if found is not None else {}))
     elif found is not None:
         _show_proof(found)
-    proved = levels.capabilities.level == 3 and (found is None or found.proof.proved)
+    proved = levels.capabilities.level == (1 if one_bank else 3) and (found is None or found.proof.proved)
     conclude("abbe runs" if proved and not levels_only else "abbe comp commission", machine=machine, as_json=as_json)
     raise typer.Exit(0 if proved else 1)
 
