@@ -25,6 +25,7 @@ from abbe.service.cli.results.show import export_campaign, runs, show
 from abbe.service.cli.results.simulate import errors, simulate
 from abbe.service.cli.results.solve import solve, solve_all
 from abbe.service.cli.tables.comp import comp
+from abbe.service.cli.tables.comp_drop import drop
 from abbe.service.cli.tables.comp_proposals import approve, diff, propose, reject, show_proposals
 from abbe.service.cli.tables.comp_push import accept_table, commission, push, rollback
 
@@ -56,6 +57,7 @@ app.command("effects", rich_help_panel=UNDERSTAND)(effects)
 app.command("errors", rich_help_panel=UNDERSTAND)(errors)
 app.command("report", rich_help_panel=UNDERSTAND)(report)
 app.command("correct", rich_help_panel=CORRECT)(correct)
+comp.command("drop")(drop)
 comp.command("commission")(commission)
 comp.command("propose")(propose)
 comp.command("show")(show_proposals)

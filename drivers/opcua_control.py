@@ -1,0 +1,208 @@
+"""A control behind an OPC UA server: its position is read, and files are put into it and read back. It moves nothing and holds no tables.
+
+A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the extra ``pip install 'abbe[opcua]'``. The URL names the nodes::
+
+    opc.tcp://192.168.0.40:4840/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ&moving=ns%3D2%3Bs%3DMoving&unit=mm
+
+``moving`` (a Boolean; optional) tells a standstill. The unit is that of the nodes' EngineeringUnits (UNECE code); ``unit`` (mm, um, m, in)
+states it where they have none, and is refused where they contradict it. A value whose quality is not good is refused. Anonymous, without
+encryption: for a network of the machine's own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable
+from typing import Any, TypeVar
+from urllib.parse import parse_qsl, urlsplit, urlunsplit
+
+from abbe.drivers.api import NOTHING_HOLDS, Condition, ControllerStatus, DeviceInfo
+from abbe.drivers.described.control import ListenedControl
+from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, ReplyTimeout, WrongDevice
+
+ANSWER_S = 4.0
+AXES = ("x", "y", "z")
+MM = {"mm": 1.0, "um": 1e-3, "m": 1e3, "in": 25.4}
+UNECE = {5066068: "mm", 13384: "um", 5067858: "m", 4804168: "in"}
+"""EUInformation.UnitId of MMT, 4H, MTR, INH: the code's letters as a number (OPC 10000-8, 5.6.3)."""
+CHUNK = 8192
+T = TypeVar("T")
+
+
+class OpcUaControl(ListenedControl):
+    """One session with the server; one request at a time."""
+
+    def __init__(self, url: str, client: Any, nodes: dict[str, str], unit: str) -> None:
+        super().__init__(None, None)
+        self.name, self._client, self._unit = url, client, unit
+        self._nodes = {name: client.get_node(node) for name, node in nodes.items()}
+        self._scale = dict.fromkeys(AXES, 0.0)
+
+    async def identify(self) -> DeviceInfo:
+        """Read the server's product and the unit of each position.
+
+        Raises
+        ------
+        WrongDevice
+            A node has no unit, or another than stated, or it is no length.
+        LinkDown, ReplyTimeout, BadFrame
+            Communication failed, or there is no such node.
+        """
+        info = await self._ask("identify", self._client.get_node("i=2260").read_value())  # Server.ServerStatus.BuildInfo
+        for axis in AXES:
+            self._scale[axis] = MM[await self._unit_of(axis)]
+        return DeviceInfo("cnc", str(info.ProductName), "", 0, str(info.SoftwareVersion))
+
+    async def _unit_of(self, axis: str) -> str:
+        names = {p.Name: p for p in [await self._ask("identify", n.read_browse_name()) for n in await self._properties(axis)]}
+        if "EngineeringUnits" not in names:
+            if not self._unit:
+                raise WrongDevice(self.name, "identify", f"the position of {axis.upper()} states no unit", "add unit=mm to its URL")
+            return self._unit
+        node = await self._ask("identify", self._nodes[axis].get_child(names["EngineeringUnits"]))
+        told = (await self._ask("identify", node.read_value())).UnitId
+        found = UNECE.get(told, "")
+        if not found or (self._unit and found != self._unit):
+            what = found or f"of unit {told}, which is no length known here"
+            raise WrongDevice(self.name, "identify", f"the position of {axis.upper()} is in {what}; stated is {self._unit or 'nothing'}")
+        return found
+
+    async def _properties(self, axis: str) -> list[Any]:
+        return list(await self._ask("identify", self._nodes[axis].get_properties()))
+
+    async def status(self) -> ControllerStatus:
+        """Read all nodes in one request; the time is that of this computer at the arrival.
+
+        Raises
+        ------
+        DeviceFault
+            A value's quality is not good, or it is no number.
+        LinkDown, ReplyTimeout, BadFrame
+            Communication failed.
+        """
+        nodes = list(self._nodes.values())
+        found = dict(zip(self._nodes, await self._ask("read status", self._client.read_attributes(nodes)), strict=True))
+        host_s = time.monotonic()
+        for name, value in found.items():
+            plain = None if value.Value is None else value.Value.Value
+            fits = isinstance(plain, bool) if name == "moving" else isinstance(plain, float | int) and not isinstance(plain, bool)
+            if not value.StatusCode.is_good() or not fits:
+                why = f"{name} is not valid ({value.StatusCode.name}: {plain!r})"
+                raise DeviceFault(self.name, "read status", why, "look at the control")
+        x, y, z = (float(found[a].Value.Value) * self._scale[a] for a in AXES)
+        holds = NOTHING_HOLDS
+        if "moving" in found:
+            holds = Condition.MOVING if found["moving"].Value.Value else Condition.IN_POSITION
+        return ControllerStatus(host_s, round(host_s * 1e6), holds, (x, y, z), 0, 0, 0, 100, 0)
+
+    async def put_file(self, node: str, data: bytes) -> None:
+        """Write a file object (OPC 10000-20) and read it back.
+
+        Raises
+        ------
+        DeviceFault
+            The server holds other bytes than were sent.
+        LinkDown, ReplyTimeout, BadFrame
+            Communication failed, or the server refuses.
+        """
+        file = self._client.get_node(node)
+        handle = await self._call(file, "Open", _byte(6))  # write, erase existing
+        try:
+            for at in range(0, len(data), CHUNK):
+                await self._call(file, "Write", _uint32(handle), data[at : at + CHUNK])
+        finally:
+            await self._call(file, "Close", _uint32(handle))
+        if await self.get_file(node) != data:
+            raise DeviceFault(self.name, "write file", f"{node} does not hold what was sent", "load nothing from it")
+
+    async def get_file(self, node: str) -> bytes:
+        """Read a file object whole; errors as for `put_file`."""
+        file, out = self._client.get_node(node), b""
+        handle = await self._call(file, "Open", _byte(1))
+        try:
+            while part := await self._call(file, "Read", _uint32(handle), _int32(CHUNK)):
+                out += part
+        finally:
+            await self._call(file, "Close", _uint32(handle))
+        return out
+
+    async def _call(self, node: Any, method: str, *arguments: Any) -> Any:
+        return await self._ask(f"{method.lower()} file", node.call_method(f"0:{method}", *arguments))
+
+    async def close(self) -> None:
+        """End the session. Closing twice does nothing."""
+        client, self._client = self._client, None
+        if client is not None:
+            try:
+                async with asyncio.timeout(ANSWER_S):
+                    await client.disconnect()
+            except (OSError, TimeoutError, asyncio.CancelledError):
+                return
+
+    async def _ask(self, operation: str, answer: Awaitable[T]) -> T:
+        return await _answered(self.name, operation, answer)
+
+
+async def _answered(name: str, operation: str, answer: Awaitable[T]) -> T:
+    from asyncua import ua
+
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            return await answer
+    except TimeoutError:
+        raise ReplyTimeout(name, operation, f"no answer within {ANSWER_S:g} s") from None
+    except OSError as error:
+        raise LinkDown(name, operation, str(error), "is the server switched on?") from None
+    except ua.UaError as error:
+        raise BadFrame(name, operation, str(error) or type(error).__name__, "are the nodes of the URL those of this server?") from None
+
+
+def _byte(value: int) -> Any:
+    from asyncua import ua
+
+    return ua.Variant(value, ua.VariantType.Byte)
+
+
+def _uint32(value: int) -> Any:
+    from asyncua import ua
+
+    return ua.Variant(value, ua.VariantType.UInt32)
+
+
+def _int32(value: int) -> Any:
+    from asyncua import ua
+
+    return ua.Variant(value, ua.VariantType.Int32)
+
+
+async def open_opcua(url: str) -> OpcUaControl:
+    """Open the control behind an ``opc.tcp://`` URL.
+
+    Raises
+    ------
+    BadUrl
+        A node of X, Y or Z is missing, a key or the unit is unknown, or the extra is not installed.
+    LinkDown, ReplyTimeout, BadFrame
+        Communication failed.
+    """
+    parts = urlsplit(url)
+    query = dict(parse_qsl(parts.query))
+    unit = query.pop("unit", "")
+    if not set(AXES) <= set(query) <= {*AXES, "moving"} or unit not in ("", *MM) or not parts.hostname:
+        remedy = "opc.tcp://HOST:PORT/?x=NODE&y=NODE&z=NODE, if need be &moving=NODE and &unit=mm, um, m or in; a node: ns%3D2%3Bs%3DX"
+        raise BadUrl(ascii(url), "read device URL", "nodes of X, Y and Z are needed", remedy)
+    try:
+        from asyncua import Client
+    except ImportError:
+        raise BadUrl(ascii(url), "open device", "OPC UA is not installed", "pip install 'abbe[opcua]'") from None
+    client = Client(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), timeout=ANSWER_S)
+    try:
+        await _answered(url, "connect", client.connect())
+        return OpcUaControl(url, client, query, unit)
+    except ValueError as error:
+        await client.disconnect()
+        raise BadUrl(ascii(url), "read device URL", str(error), "write a node as ns%3D2%3Bs%3DX") from None
+
+
+DRIVER = {"cnc": open_opcua}

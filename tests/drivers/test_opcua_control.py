@@ -1,0 +1,152 @@
+"""A control behind OPC UA, as a plug-in, against asyncua's own server: positions with unit and quality, and a file that is read back."""
+
+from __future__ import annotations
+
+import socket
+import tomllib
+from collections.abc import AsyncIterator
+from dataclasses import dataclass, field
+from importlib.metadata import EntryPoint
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
+
+from asyncua import Server, ua
+
+from abbe.drivers.api import Condition, only_listens
+from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, NotProved, WrongDevice
+from abbe.drivers.opcua_control import DRIVER, MM, UNECE, OpcUaControl
+
+ROOT = Path(__file__).resolve().parents[2]
+X, Y, Z, MOVING, FILE = ("ns=2;s=" + name for name in ("X", "Y", "Z", "Moving", "Table"))
+
+
+@dataclass
+class Plant:
+    """A control's server: three positions, one Boolean, one file object whose content is here."""
+
+    server: Any
+    url: str
+    nodes: dict[str, Any] = field(default_factory=dict)
+    content: bytes = b"old"
+    spoils: bool = False
+    at: int = 0
+
+    def asked(self, unit: str = "") -> str:
+        pairs = {"x": X, "y": Y, "z": Z, "moving": MOVING} | ({"unit": unit} if unit else {})
+        return f"{self.url}?" + "&".join(f"{k}={v.replace('=', '%3D').replace(';', '%3B')}" for k, v in pairs.items())
+
+
+async def _file(plant: Plant, index: int) -> None:
+    """A file object (OPC 10000-20) with Open, Read, Write, Close."""
+
+    async def opened(parent: Any, mode: Any) -> list[Any]:
+        plant.at = 0
+        plant.content = b"" if mode.Value & 4 else plant.content
+        return [ua.Variant(7, ua.VariantType.UInt32)]
+
+    async def read(parent: Any, handle: Any, count: Any) -> list[Any]:
+        part, plant.at = plant.content[plant.at : plant.at + count.Value], plant.at + count.Value
+        return [ua.Variant(part, ua.VariantType.ByteString)]
+
+    async def write(parent: Any, handle: Any, data: Any) -> list[Any]:
+        plant.content += data.Value[:-1] if plant.spoils else data.Value
+        return []
+
+    async def closed(parent: Any, handle: Any) -> list[Any]:
+        return []
+
+    node = await plant.server.nodes.objects.add_object(ua.NodeId("Table", index), "Table")
+    for name, does in (("Open", opened), ("Read", read), ("Write", write), ("Close", closed)):
+        await node.add_method(ua.NodeId(f"Table.{name}", index), ua.QualifiedName(name, 0), does)
+
+
+@pytest.fixture
+async def plant() -> AsyncIterator[Plant]:
+    with socket.create_server(("127.0.0.1", 0)) as held:
+        port = held.getsockname()[1]
+    server = Server()
+    await server.init()
+    url = f"opc.tcp://127.0.0.1:{port}/"
+    server.set_endpoint(url)
+    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    index = await server.register_namespace("urn:mill")
+    plant = Plant(server, url)
+    for name, value in (("X", 1.5), ("Y", -20.0), ("Z", 300.25), ("Moving", False)):
+        node = await server.nodes.objects.add_variable(ua.NodeId(name, index), name, value)
+        plant.nodes[name] = node
+        if name != "Moving":
+            unit = ua.EUInformation(NamespaceUri="http://www.opcfoundation.org/UA/units/un/cefact", UnitId=5066068)
+            await node.add_property(ua.NodeId(f"{name}.unit", index), ua.QualifiedName("EngineeringUnits", 0), unit)
+    await _file(plant, index)
+    async with server:
+        yield plant
+
+
+async def _open(url: str) -> OpcUaControl:
+    control = await DRIVER["cnc"](url)
+    try:
+        await control.identify()
+    except BaseException:
+        await control.close()
+        raise
+    return control
+
+
+def test_unit_codes_are_the_letters_of_unece() -> None:
+    assert {code.to_bytes(3, "big").lstrip(b"\0").decode(): name for code, name in UNECE.items()} == {
+        "MMT": "mm", "4H": "um", "MTR": "m", "INH": "in",
+    }  # fmt: skip
+    assert set(UNECE.values()) == set(MM)
+
+
+async def test_positions_are_read_with_unit_and_quality(plant: Plant) -> None:
+    control = await _open(plant.asked())
+    try:
+        assert only_listens(control)
+        status = await control.status()
+        assert (status.position_mm, status.conditions) == ((1.5, -20.0, 300.25), Condition.IN_POSITION)
+        await plant.nodes["Moving"].write_value(True)
+        assert (await control.status()).moving
+        uncertain = ua.DataValue(ua.Variant(1.5), ua.StatusCode(ua.StatusCodes.BadSensorFailure))
+        await plant.nodes["X"].write_value(uncertain)
+        with pytest.raises(DeviceFault, match=r"x is not valid \(BadSensorFailure"):
+            await control.status()
+        with pytest.raises(NotProved, match="no table is written"):
+            await control.write_bank(0, b"")
+    finally:
+        await control.close()
+    with pytest.raises(WrongDevice, match="X is in mm; stated is in"):
+        await _open(plant.asked("in"))
+
+
+async def test_a_file_is_put_into_it_and_read_back(plant: Plant) -> None:
+    control = await _open(plant.asked("mm"))
+    try:
+        table = bytes(range(256)) * 100
+        await control.put_file(FILE, table)
+        assert (plant.content, await control.get_file(FILE)) == (table, table)
+        plant.spoils = True
+        with pytest.raises(DeviceFault, match="does not hold what was sent"):
+            await control.put_file(FILE, table)
+        with pytest.raises(BadFrame, match="are the nodes"):
+            await control.get_file("ns=2;s=Nothing")
+    finally:
+        await control.close()
+
+
+def test_the_package_offers_it_by_its_scheme() -> None:
+    offered = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["abbe.drivers"]
+    assert EntryPoint("opc.tcp", offered["opc.tcp"], "abbe.drivers").load() is DRIVER
+
+
+async def test_what_cannot_be_opened_is_named() -> None:
+    with pytest.raises(BadUrl, match="nodes of X, Y and Z are needed"):
+        await DRIVER["cnc"]("opc.tcp://127.0.0.1:4840/?x=ns%3D2%3Bs%3DX")
+    with socket.create_server(("127.0.0.1", 0)) as held:
+        port = held.getsockname()[1]
+    with pytest.raises(LinkDown, match="is the server switched on"):
+        await DRIVER["cnc"](f"opc.tcp://127.0.0.1:{port}/?x={X}&y={Y}&z={Z}".replace(";", "%3B"))
