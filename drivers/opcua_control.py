@@ -1,4 +1,4 @@
-"""A control behind an OPC UA server: its position is read, and files are put into it and read back. It moves nothing and holds no tables.
+"""A control behind an OPC UA server: its position is read, and files are put into it and read. It moves nothing and holds no tables.
 
 A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the extra ``pip install 'abbe[opcua]'``. The URL names the nodes::
 
@@ -96,52 +96,59 @@ class OpcUaControl(ListenedControl):
             holds = Condition.MOVING if found["moving"].Value.Value else Condition.IN_POSITION
         return ControllerStatus(host_s, round(host_s * 1e6), holds, (x, y, z), 0, 0, 0, 100, 0)
 
-    async def put_file(self, node: str, data: bytes) -> None:
-        """Write a file object (OPC 10000-20) and read it back.
-
-        Raises
-        ------
-        DeviceFault
-            The server holds other bytes than were sent.
-        LinkDown, ReplyTimeout, BadFrame
-            Communication failed, or the server refuses.
-        """
-        file = self._client.get_node(node)
-        handle = await self._call(file, "Open", _byte(6))  # write, erase existing
-        try:
-            for at in range(0, len(data), CHUNK):
-                await self._call(file, "Write", _uint32(handle), data[at : at + CHUNK])
-        finally:
-            await self._call(file, "Close", _uint32(handle))
-        if await self.get_file(node) != data:
-            raise DeviceFault(self.name, "write file", f"{node} does not hold what was sent", "load nothing from it")
-
-    async def get_file(self, node: str) -> bytes:
-        """Read a file object whole; errors as for `put_file`."""
-        file, out = self._client.get_node(node), b""
-        handle = await self._call(file, "Open", _byte(1))
-        try:
-            while part := await self._call(file, "Read", _uint32(handle), _int32(CHUNK)):
-                out += part
-        finally:
-            await self._call(file, "Close", _uint32(handle))
-        return out
-
-    async def _call(self, node: Any, method: str, *arguments: Any) -> Any:
-        return await self._ask(f"{method.lower()} file", node.call_method(f"0:{method}", *arguments))
-
     async def close(self) -> None:
         """End the session. Closing twice does nothing."""
         client, self._client = self._client, None
         if client is not None:
-            try:
-                async with asyncio.timeout(ANSWER_S):
-                    await client.disconnect()
-            except (OSError, TimeoutError, asyncio.CancelledError):
-                return
+            await _ended(client)
 
     async def _ask(self, operation: str, answer: Awaitable[T]) -> T:
         return await _answered(self.name, operation, answer)
+
+
+class OpcUaFiles:
+    """Files that a control offers as file objects (OPC 10000-20): ``nodes``, node by name of the file."""
+
+    def __init__(self, url: str, client: Any, nodes: dict[str, str]) -> None:
+        self.name, self._client = url, client
+        self._nodes = {name: client.get_node(node) for name, node in nodes.items()}
+
+    @property
+    def names(self) -> frozenset[str]:
+        """Names of the files."""
+        return frozenset(self._nodes)
+
+    async def put(self, name: str, data: bytes) -> None:
+        """Write a file, erasing what it holds.
+
+        Raises
+        ------
+        LinkDown, ReplyTimeout, BadFrame
+            Communication failed, or the server refuses.
+        """
+        handle = await self._call(name, "Open", _number(6, "Byte"))
+        try:
+            for at in range(0, len(data), CHUNK):
+                await self._call(name, "Write", _number(handle, "UInt32"), data[at : at + CHUNK])
+        finally:
+            await self._call(name, "Close", _number(handle, "UInt32"))
+
+    async def get(self, name: str) -> bytes:
+        """Read a file whole; errors as for `put`."""
+        handle, out = await self._call(name, "Open", _number(1, "Byte")), b""
+        try:
+            while part := await self._call(name, "Read", _number(handle, "UInt32"), _number(CHUNK, "Int32")):
+                out += part
+        finally:
+            await self._call(name, "Close", _number(handle, "UInt32"))
+        return out
+
+    async def _call(self, name: str, method: str, *arguments: Any) -> Any:
+        return await _answered(self.name, f"{method.lower()} file", self._nodes[name].call_method(f"0:{method}", *arguments))
+
+    async def close(self) -> None:
+        """End the session."""
+        await _ended(self._client)
 
 
 async def _answered(name: str, operation: str, answer: Awaitable[T]) -> T:
@@ -158,22 +165,18 @@ async def _answered(name: str, operation: str, answer: Awaitable[T]) -> T:
         raise BadFrame(name, operation, str(error) or type(error).__name__, "are the nodes of the URL those of this server?") from None
 
 
-def _byte(value: int) -> Any:
+async def _ended(client: Any) -> None:
+    try:
+        async with asyncio.timeout(ANSWER_S):
+            await client.disconnect()
+    except (OSError, TimeoutError):
+        return
+
+
+def _number(value: int, kind: str) -> Any:
     from asyncua import ua
 
-    return ua.Variant(value, ua.VariantType.Byte)
-
-
-def _uint32(value: int) -> Any:
-    from asyncua import ua
-
-    return ua.Variant(value, ua.VariantType.UInt32)
-
-
-def _int32(value: int) -> Any:
-    from asyncua import ua
-
-    return ua.Variant(value, ua.VariantType.Int32)
+    return ua.Variant(value, ua.VariantType[kind])
 
 
 async def open_opcua(url: str) -> OpcUaControl:
@@ -192,17 +195,47 @@ async def open_opcua(url: str) -> OpcUaControl:
     if not set(AXES) <= set(query) <= {*AXES, "moving"} or unit not in ("", *MM) or not parts.hostname:
         remedy = "opc.tcp://HOST:PORT/?x=NODE&y=NODE&z=NODE, if need be &moving=NODE and &unit=mm, um, m or in; a node: ns%3D2%3Bs%3DX"
         raise BadUrl(ascii(url), "read device URL", "nodes of X, Y and Z are needed", remedy)
+    client = await _connected(url)
+    try:
+        return OpcUaControl(url, client, query, unit)
+    except ValueError as error:
+        raise await _bad_node(url, client, error) from None
+
+
+async def open_files(url: str) -> OpcUaFiles:
+    """Open the files behind ``opc.tcp://HOST:PORT/?NAME=NODE&NAME=NODE``.
+
+    Raises
+    ------
+    BadUrl
+        There is no file in the URL, or the extra is not installed.
+    LinkDown, ReplyTimeout, BadFrame
+        Communication failed.
+    """
+    query = dict(parse_qsl(urlsplit(url).query))
+    if not query:
+        raise BadUrl(ascii(url), "read URL", "it names no file", "opc.tcp://HOST:PORT/?NAME=NODE, a node: ns%3D2%3Bs%3DTable")
+    client = await _connected(url)
+    try:
+        return OpcUaFiles(url, client, query)
+    except ValueError as error:
+        raise await _bad_node(url, client, error) from None
+
+
+async def _connected(url: str) -> Any:
     try:
         from asyncua import Client
     except ImportError:
         raise BadUrl(ascii(url), "open device", "OPC UA is not installed", "pip install 'abbe[opcua]'") from None
+    parts = urlsplit(url)
     client = Client(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), timeout=ANSWER_S)
-    try:
-        await _answered(url, "connect", client.connect())
-        return OpcUaControl(url, client, query, unit)
-    except ValueError as error:
-        await client.disconnect()
-        raise BadUrl(ascii(url), "read device URL", str(error), "write a node as ns%3D2%3Bs%3DX") from None
+    await _answered(url, "connect", client.connect())
+    return client
+
+
+async def _bad_node(url: str, client: Any, error: ValueError) -> BadUrl:
+    await _ended(client)
+    return BadUrl(ascii(url), "read device URL", str(error), "write a node as ns%3D2%3Bs%3DX")
 
 
 DRIVER = {"cnc": open_opcua}

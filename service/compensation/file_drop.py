@@ -1,4 +1,4 @@
-"""Table files for a control without an interface: put into its folder (share, USB), read back, kept, confirmed, taken back.
+"""Table files for a control: put into its folder (share, medium) or its OPC UA files, read back, kept, confirmed, taken back.
 
 Beside the exported files ``OUT`` a folder ``OUT.dropped`` holds ``receipt.json`` (`abbe-drop/1`) and ``before/``, the files that lay in the
 control's folder. The receipt is on disk before the first file is written, so an interrupted drop can be taken back. A person loads the
@@ -8,6 +8,7 @@ a person says to have seen is recorded as that, and is not a confirmation.
 
 from __future__ import annotations
 
+import asyncio
 import hashlib
 import json
 from collections.abc import Mapping
@@ -15,6 +16,7 @@ from dataclasses import asdict, dataclass, replace
 from datetime import datetime
 from pathlib import Path
 
+from abbe.drivers.opcua_control import open_files
 from abbe.service.clock import utc_text
 from abbe.service.compensation.comp_export import alike_mm, contents, control_for, read_files, read_key
 from abbe.service.errors import FileFormatError
@@ -24,7 +26,7 @@ from abbe.service.rendering.page_file import write_page
 
 FORMAT = "abbe-drop/1"
 RECEIPT, BEFORE = "receipt.json", "before"
-LOOK = "look at the folder; nothing was written"
+LOOK = "look at it; nothing was written"
 
 
 @dataclass(frozen=True, slots=True)
@@ -44,61 +46,123 @@ class Drop:
     seen_by: str = ""
 
 
+class Folder:
+    """A folder as the place where a control reads files."""
+
+    def __init__(self, path: Path) -> None:
+        if not path.is_dir():
+            raise FileFormatError(f"{path}: is no folder", "mount the control's folder or medium")
+        self.name, self._path = str(path.resolve()), path
+
+    def get(self, name: str) -> bytes | None:
+        """Return a file's content; None if it is not there."""
+        file = self._path / name
+        return file.read_bytes() if file.is_file() else None
+
+    def put(self, name: str, content: bytes | None) -> None:
+        """Write a file whole or not at all; None removes it."""
+        if content is None:
+            (self._path / name).unlink(missing_ok=True)
+        else:
+            write_page(content, self._path / name)
+
+
+class OpcUaPlace:
+    """The file objects of an OPC UA server as that place: ``opc.tcp://HOST:PORT/?NAME=NODE``."""
+
+    def __init__(self, url: str) -> None:
+        self.name = url
+
+    def get(self, name: str) -> bytes | None:
+        """Return a file's content; a file without any counts as not there."""
+        return asyncio.run(self._do(name, None)) or None
+
+    def put(self, name: str, content: bytes | None) -> None:
+        """Write a file; None empties it."""
+        asyncio.run(self._do(name, content or b""))
+
+    async def _do(self, name: str, content: bytes | None) -> bytes:
+        files = await open_files(self.name)
+        try:
+            if name not in files.names:
+                raise FileFormatError(f"{self.name}: names no node for {name}", f"add {name}=NODE to the URL")
+            if content is None:
+                return await files.get(name)
+            await files.put(name, content)
+            return content
+        finally:
+            await files.close()
+
+
+Place = Folder | OpcUaPlace
+
+
+def place_at(text: str) -> Place:
+    """Return the place of a folder or an ``opc.tcp://`` URL.
+
+    Raises
+    ------
+    FileFormatError
+        There is no such folder.
+    """
+    return OpcUaPlace(text) if text.startswith("opc.tcp://") else Folder(Path(text))
+
+
 def place_of(source: Path) -> Path:
     """Folder of a drop's receipt."""
     return source.with_name(source.name + ".dropped")
 
 
-def drop(source: Path, folder: Path, *, machine: str, form: str, now: datetime) -> Drop:
-    """Put exported files into a control's folder, keep what lay there, and read them back.
+def drop(source: Path, to: Place, *, machine: str, form: str, now: datetime) -> Drop:
+    """Put exported files where a control reads them, keep what lay there, and read them back.
 
     Raises
     ------
     FileFormatError
-        The folder is missing, the files were dropped already, or a file cannot be written or is another one when read back.
+        The files were dropped already, or a file cannot be written or is another one when read back.
+    DriverError
+        The server of the files does not answer.
     """
-    new, place = contents(source), place_of(source)
-    if not folder.is_dir():
-        raise FileFormatError(f"{folder}: is no folder", "mount the control's folder or medium")
-    if (place / RECEIPT).exists() and receipt(source).state != "taken back":
-        raise FileFormatError(f"{place}: these files were dropped already", "confirm them or take them back: abbe comp drop --help")
-    old = {name: (folder / name).read_bytes() if (folder / name).is_file() else None for name in new}
-    made = Drop(machine, form, str(folder.resolve()), _sums(new), _sums(old), utc_text(now))
+    new, aside = contents(source), place_of(source)
+    if (aside / RECEIPT).exists() and receipt(source).state != "taken back":
+        raise FileFormatError(f"{aside}: these files were dropped already", "confirm them or take them back: abbe comp drop --help")
+    old = {name: to.get(name) for name in new}
+    made = Drop(machine, form, to.name, _sums(new), _sums(old), utc_text(now))
     try:
-        (place / BEFORE).mkdir(parents=True, exist_ok=True)
+        (aside / BEFORE).mkdir(parents=True, exist_ok=True)
         for name, content in old.items():
             if content is not None:
-                write_page(content, place / BEFORE / name)
-        _keep(place, made)
-        _put(folder, new)
+                write_page(content, aside / BEFORE / name)
+        _keep(aside, made)
+        _put(to, new)
     except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be written: {error.strerror}", "abbe comp drop --take-back undoes what was done") from None
-    return _keep(place, replace(made, state="written"))
+        raise FileFormatError(
+            f"{to.name}: cannot be written: {error.strerror}", "abbe comp drop --take-back undoes what was done"
+        ) from None
+    return _keep(aside, replace(made, state="written"))
 
 
 def take_back(source: Path) -> Drop:
-    """Put the files that lay there before into the folder again; files that somebody changed since are left alone.
+    """Put the files that lay there before into their place again; files that somebody changed since are left alone.
 
     Raises
     ------
     FileFormatError
-        There is no receipt, or a file in the folder is neither the dropped one nor the one before.
+        There is no receipt, or a file there is neither the dropped one nor the one before.
+    DriverError
+        The server of the files does not answer.
     """
-    place = place_of(source)
-    made, folder = receipt(source), Path(receipt(source).folder)
-    here = {name: (folder / name).read_bytes() if (folder / name).is_file() else None for name in made.files}
-    strange = [name for name, total in _sums(here).items() if total not in (made.files[name], made.before[name])]
+    made, aside = receipt(source), place_of(source)
+    to = place_at(made.folder)
+    here = _sums({name: to.get(name) for name in made.files})
+    strange = [name for name, total in here.items() if total not in (made.files[name], made.before[name])]
     if strange:
-        raise FileFormatError(f"{folder / strange[0]}: was changed since it was dropped", LOOK)
+        raise FileFormatError(f"{made.folder}: {strange[0]} was changed since it was dropped", LOOK)
     try:
-        for name, total in made.before.items():
-            if total:
-                _put(folder, {name: (place / BEFORE / name).read_bytes()})
-            else:
-                (folder / name).unlink(missing_ok=True)
+        _put(to, {name: (aside / BEFORE / name).read_bytes() if total else None for name, total in made.before.items()})
     except OSError as error:
-        raise FileFormatError(f"{folder}: cannot be written: {error.strerror}", "try again") from None
-    return _keep(place, replace(made, state="taken back", seen_by=""))
+        raise FileFormatError(f"{made.folder}: cannot be written: {error.strerror}", "try again") from None
+    return _keep(aside, replace(made, state="taken back", seen_by=""))
 
 
 def confirm(source: Path, back: Path, settings: FormatSettings, *, turned: bool = False) -> Drop:
@@ -163,11 +227,11 @@ def _sums(files: Mapping[str, bytes | None]) -> dict[str, str]:
     return {name: "" if content is None else hashlib.sha256(content).hexdigest() for name, content in files.items()}
 
 
-def _put(folder: Path, files: Mapping[str, bytes]) -> None:
+def _put(to: Place, files: Mapping[str, bytes | None]) -> None:
     for name, content in files.items():
-        write_page(content, folder / name)
-        if (folder / name).read_bytes() != content:
-            raise FileFormatError(f"{folder / name}: holds other bytes than were written", "load nothing from it; try another medium")
+        to.put(name, content)
+        if to.get(name) != content:
+            raise FileFormatError(f"{to.name}: {name} holds other bytes than were written", "load nothing from it; try another medium")
 
 
 def _keep(place: Path, made: Drop) -> Drop:

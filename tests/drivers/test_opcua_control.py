@@ -18,7 +18,7 @@ from asyncua import Server, ua
 
 from abbe.drivers.api import Condition, only_listens
 from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, NotProved, WrongDevice
-from abbe.drivers.opcua_control import DRIVER, MM, UNECE, OpcUaControl
+from abbe.drivers.opcua_control import DRIVER, MM, UNECE, OpcUaControl, open_files
 
 ROOT = Path(__file__).resolve().parents[2]
 X, Y, Z, MOVING, FILE = ("ns=2;s=" + name for name in ("X", "Y", "Z", "Moving", "Table"))
@@ -124,18 +124,16 @@ async def test_positions_are_read_with_unit_and_quality(plant: Plant) -> None:
 
 
 async def test_a_file_is_put_into_it_and_read_back(plant: Plant) -> None:
-    control = await _open(plant.asked("mm"))
+    files = await open_files(f"{plant.url}?x.tab={FILE}&gone=ns=2;s=Nothing".replace(";", "%3B").replace("ns=2", "ns%3D2"))
     try:
         table = bytes(range(256)) * 100
-        await control.put_file(FILE, table)
-        assert (plant.content, await control.get_file(FILE)) == (table, table)
-        plant.spoils = True
-        with pytest.raises(DeviceFault, match="does not hold what was sent"):
-            await control.put_file(FILE, table)
+        assert (files.names, await files.get("x.tab")) == ({"x.tab", "gone"}, b"old")
+        await files.put("x.tab", table)
+        assert (plant.content, await files.get("x.tab")) == (table, table)
         with pytest.raises(BadFrame, match="are the nodes"):
-            await control.get_file("ns=2;s=Nothing")
+            await files.get("gone")
     finally:
-        await control.close()
+        await files.close()
 
 
 def test_the_package_offers_it_by_its_scheme() -> None:

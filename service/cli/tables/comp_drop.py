@@ -18,7 +18,8 @@ def drop(  # noqa: PLR0913 - one argument for each option
         str | None, typer.Option("--format", metavar="F", help="With --to: format or control of the export.", show_default=False)
     ] = None,
     to: Annotated[
-        Path | None, typer.Option("--to", metavar="FOLDER", help="The control's folder: share or medium.", show_default=False)
+        str | None,
+        typer.Option("--to", metavar="PLACE", help="The control's folder, or opc.tcp://HOST:PORT/?FILE=NODE.", show_default=False),
     ] = None,
     back: Annotated[
         Path | None,
@@ -45,10 +46,10 @@ def drop(  # noqa: PLR0913 - one argument for each option
 
     site = site_of(load_machine(machine_file(machine)).machine)
     if sum((to is not None, back is not None, seen, take_back)) != 1 or (to is None) != (form is None):
-        raise FormatRefused("give one of --to FOLDER --format F, --back PATH, --seen, --take-back", "abbe comp drop --help")
+        raise FormatRefused("give one of --to PLACE --format F, --back PATH, --seen, --take-back", "abbe comp drop --help")
     if to is not None and form is not None:
         control_for(form)
-        made = file_drop.drop(source, to, machine=site.name, form=form, now=SystemClock().utc())
+        made = file_drop.drop(source, file_drop.place_at(to), machine=site.name, form=form, now=SystemClock().utc())
         text = f"{len(made.files)} files lie in {made.folder}, read back; now load them at the control"
     elif back is not None:
         control, at = control_for(file_drop.receipt(source).form), reference_of(reference)

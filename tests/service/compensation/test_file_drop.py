@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 from datetime import UTC, datetime
 from pathlib import Path
@@ -10,6 +11,9 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.compensation import file_drop
+from abbe.service.errors import FileFormatError
+from tests.drivers.test_opcua_control import Plant
+from tests.drivers.test_opcua_control import plant as plant
 from tests.service.formats.test_choice import _document, _known
 
 MACHINE = """
@@ -97,7 +101,7 @@ def test_it_is_taken_back_also_after_an_interruption(
 
     monkeypatch.setattr(file_drop, "write_page", dies)
     with pytest.raises(KeyboardInterrupt):
-        file_drop.drop(Path("out"), Path("share"), machine="mill", form="mach4", now=datetime(2026, 1, 1, tzinfo=UTC))
+        file_drop.drop(Path("out"), file_drop.place_at("share"), machine="mill", form="mach4", now=datetime(2026, 1, 1, tzinfo=UTC))
     monkeypatch.setattr(file_drop, "write_page", real)
     assert file_drop.receipt(Path("out")).state == "writing"
     assert _drop("--back", "share") == 2  # nothing to confirm
@@ -111,7 +115,7 @@ def test_a_file_that_somebody_changed_is_left_alone(share: Path, capsys: pytest.
     _drop("--to", "share", "--format", "mach4")
     (share / "mach4-z.csv").write_text("a person's")
     assert _drop("--take-back") == 2
-    assert "mach4-z.csv: was changed since it was dropped" in capsys.readouterr().err
+    assert "mach4-z.csv was changed since it was dropped" in capsys.readouterr().err
     assert (share / "mach4-z.csv").read_text() == "a person's"
     assert (share / "mach4-x.csv").read_text() != "the old table"
 
@@ -121,3 +125,21 @@ def test_one_thing_at_a_time(share: Path, capsys: pytest.CaptureFixture[str]) ->
     assert _drop("--to", "share") == 2
     assert _drop("--to", "nowhere", "--format", "mach4") == 2
     assert "nowhere: is no folder" in capsys.readouterr().err
+
+
+async def test_the_files_of_an_opc_ua_server_are_such_a_place(plant: Plant, tmp_path: Path) -> None:
+    """Its one file object holds the table before, the dropped one, and the one before again; a server that spoils a byte is refused."""
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "x.tab").write_text("the new table")
+    place = file_drop.place_at(f"{plant.url}?x.tab=ns%3D2%3Bs%3DTable")
+    now = datetime(2026, 1, 1, tzinfo=UTC)
+    made = await asyncio.to_thread(file_drop.drop, tmp_path / "out", place, machine="mill", form="centroid", now=now)
+    assert (made.state, plant.content) == ("written", b"the new table")
+    assert (await asyncio.to_thread(file_drop.take_back, tmp_path / "out")).state == "taken back"
+    assert plant.content == b"old"
+    plant.spoils = True
+    with pytest.raises(FileFormatError, match=r"x\.tab holds other bytes than were written"):
+        await asyncio.to_thread(file_drop.drop, tmp_path / "out", place, machine="mill", form="centroid", now=now)
+    (tmp_path / "out" / "y.tab").write_text("a second")
+    with pytest.raises(FileFormatError, match=r"names no node for y\.tab"):
+        await asyncio.to_thread(place.get, "y.tab")
