@@ -40,8 +40,8 @@ def nominal() -> Vectors:
     return np.array([[i % 5 * PITCH_MM, i // 5 * PITCH_MM] for i in range(25)])
 
 
-def campaign(folder: Path, *, seed: int = 1, length: bool = True, noise_mm: float = 2e-4) -> Path:
-    """Write the campaign and return the folder."""
+def campaign(folder: Path, *, seed: int = 1, length: bool = True, noise_mm: float = 2e-4, turned: str = "") -> Path:
+    """Write the campaign and return the folder; ``turned``: run whose plate lies a quarter turn further about its centre than stated."""
     rng = np.random.default_rng(seed)
     form = 0.02 * rng.standard_normal((25, 2))
     n = nominal()
@@ -58,12 +58,18 @@ def campaign(folder: Path, *, seed: int = 1, length: bool = True, noise_mm: floa
     }  # fmt: skip
     entries = []
     for k, (quarter, origin) in enumerate(POSES, start=1):
-        run = _run(f"p{k}", 600.0 * k, quarter, np.array(origin), form, rng, noise_mm)
+        run = _run(f"p{k}", 600.0 * k, quarter, np.array(origin), _quarter(form) if turned == f"p{k}" else form, rng, noise_mm)
         entries.append({"run_id": f"p{k}", "test": "artefact_points", "role": "identify", "file": f"p{k}.json"})
         head["setups"][f"p{k}"] = {"kind": "artefact", "t_set_s": 600.0 * k}  # type: ignore[index]
         (folder / f"p{k}.json").write_text(json.dumps(run))
     (folder / "campaign.json").write_text(json.dumps(head | {"runs": entries}))
     return folder
+
+
+def _quarter(form: Vectors) -> Vectors:
+    """Form that is found at every place if the plate lies a quarter turn further: that of another hole, turned."""
+    at = [5 * (4 - i % 5) + i // 5 for i in range(25)]
+    return np.stack([-form[at, 1], form[at, 0]], axis=1)
 
 
 def _run(label: str, t_s: float, quarter: int, origin: Vectors, form: Vectors, rng: np.random.Generator, noise_mm: float) -> dict[str, Any]:

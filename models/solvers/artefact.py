@@ -16,7 +16,7 @@ the farthest feature: rotation or scale growing with r^2, bends; what clamping o
 CMM), ``cmm_<artefact>`` (its scale), ``stylus_<source>`` (mm),
 ``lobing_<direction>_x/y/z`` (mm, machine axes: touches that start in this direction against the usual one; along a wall: this direction),
 ``clamp_<setup>_..``, ``warp_<setup>_..`` (mm at the farthest feature: bends in one pose), ``calibration_<artefact>_<from>_<to>`` (mm),
-and fine structure of the machine (`Fine`).
+``step_<setup>_x/y/z/a/b/c`` (mm, rad: it moved during the run), and fine structure of the machine (`Fine`).
 
 Source: artefact-based self-calibration by reversal, Evans, Hocken and Estler, CIRP Annals 45/2 (1996) 617.
 """
@@ -103,6 +103,8 @@ class ArtefactPoints:
         Whether a length of the artefact is calibrated.
     fine : tuple of Fine
         Fine structure of the machine that the solution includes, the same in all runs.
+    step_s : float
+        Time from which the artefact lies elsewhere, because it moved during the run.
     """
 
     artefact: str
@@ -124,6 +126,7 @@ class ArtefactPoints:
     far_mm: F2 = field(default_factory=lambda: np.zeros((0, 3)))
     u_mm: F1 = field(default_factory=lambda: np.zeros(0))
     fine: tuple[Fine, ...] = ()
+    step_s: float = float("inf")
 
     @property
     def sign(self) -> float:
@@ -192,6 +195,7 @@ def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPrior
         out[f"cmm_{a}"] = max(p.u_cmm_scale, 1e-8)
     shear = priors.shear if p.source == "probe" else max(p.u_cmm_scale, 1e-8)
     out |= {name: shear * p.reach_mm if "shear_" in name else priors.twist_mm for name in _shapes(p, p.nominal_mm)}
+    out |= _steps(p, setup)
     if p.source == "probe":
         out |= {name: priors.warp_mm if name.startswith("warp_") else priors.clamp_mm for name in _bends(p, setup)}
     out |= {one.name: one.size_mm or priors.nugget_mm for one in p.fine}
@@ -247,6 +251,7 @@ class ArtefactReading:
     smooth_mm: F2
     rows: Callable[[F2], F2]
     since_s: F1
+    t_s: F1
 
     @property
     def deviation_mm(self) -> F2:
@@ -290,7 +295,8 @@ class ArtefactReading:
         if p.source != "probe":
             return []
         bends = _bends(p, self.setup)
-        return lobing(p) + [(name, shape[np.arange(len(shape)), p.component]) for name, shape in bends.items()]
+        moved = zip(_steps(p, self.setup), step_columns(p, self.t_s >= p.step_s).T, strict=False)
+        return [*lobing(p), *moved, *((name, shape[np.arange(len(shape)), p.component]) for name, shape in bends.items())]
 
     def _length(self) -> tuple[F1, F2]:
         """Calibrated length minus nominal, and the unit vectors from the first to the second feature."""
@@ -368,6 +374,21 @@ def _place_slopes(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nom
     out[f"expansion_{p.artefact}"] = along * warmer
     out[f"warmth_{p.artefact}"] = along * expansion * {"probe": 1.0, "cmm": -1.0, "length": 0.0}[p.source]
     return out
+
+
+def _steps(p: ArtefactPoints, setup: str) -> dict[str, float]:
+    """Unknowns of a motion of the artefact during a run, with their prior standard deviations."""
+    if not np.isfinite(p.step_s):
+        return {}
+    return {f"step_{setup}_{k}": 0.1 for k in LETTERS} | {f"step_{setup}_{k}": 1e-3 for k in TURNS}
+
+
+def step_columns(p: ArtefactPoints, after: NDArray[np.bool_]) -> F2:
+    """First-order readings per unit of a shift (machine axes) and turn (artefact axes) of the artefact after a time, shape (n, 6)."""
+    mine = np.eye(3)[p.component]
+    turns = np.cross(np.eye(3)[None], (p.nominal_mm - p.middle_mm)[:, None])
+    whole = np.concatenate([p.matrix.T[p.component], np.einsum("ni,nki->nk", mine, turns)], axis=1)
+    return np.asarray(whole * after[:, None])
 
 
 def _bends(p: ArtefactPoints, setup: str) -> dict[str, F2]:

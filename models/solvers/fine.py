@@ -73,6 +73,12 @@ class Score:
         whole = np.eye(len(asked)) + size**2 * information
         return float(size**2 * asked @ np.linalg.solve(whole, asked)), float(0.5 * np.linalg.slogdet(whole)[1])
 
+    def gain_rescaled(self, columns: F2) -> float:
+        """Gain of log evidence by unknowns of size 1 in these columns if the noise is estimated anew."""
+        explained, used = self.gain(columns, 1.0)
+        total = float(self.weight @ self.left**2)
+        return float(_evidence(np.array(explained / max(total, 1e-12) * self.left.size), np.array(float(self.left.size)))) - used
+
 
 def refined(problem: CampaignProblem, fit: CampaignFit, solve: Solve) -> tuple[CampaignProblem, CampaignFit]:
     """Add fine structure to the solution of a campaign of artefacts where the readings show it."""

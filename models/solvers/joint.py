@@ -202,14 +202,14 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         raise ValueError("joint solution: no runs")
     report = progress or _silent
     noise = expected_noise(runs, sigma_mm, floor_mm)
-    if all(run.kind == "artefact" for run in runs):
+    points = all(run.kind == "artefact" for run in runs)
+    if points:
         priors = replace(priors or Priors(), pooled=True)
     terms = _six() if model == "rigid6" else smooth_terms(order or SMOOTH_ORDER)
     problem = build(machine, terms, runs, priors or Priors(), noise)
     fit = settle(problem, report)
     if model == "rigid6":
         return _solution(problem, fit, "rigid6", 1, None)
-    points = all(run.kind == "artefact" for run in runs)
     if order is None and points:
         problem, fit = refined(problem, fit, lambda fine: _again(machine, terms, fine, priors or Priors(), noise, report))
     if order is None and rough_evidence(problem, fit, rough_terms()) > (ROUGH_POINTS if points else ROUGH_EVIDENCE):
@@ -224,6 +224,11 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     chosen = order or max(choice.chosen, 1)
     report(f"order {chosen}" + ("" if order else " chosen by held-out runs"))
     return _solution(problem, fit, "rigid21", chosen, None if order else choice)
+
+
+def settled_points(machine: Machine, runs: tuple[RunData, ...], priors: Priors) -> tuple[CampaignProblem, CampaignFit]:
+    """Settle a campaign of artefacts with smooth motions only: what a search for faults needs."""
+    return _again(machine, smooth_terms(SMOOTH_ORDER), runs, replace(priors, pooled=True), expected_noise(runs, None, None), _silent)
 
 
 def _again(

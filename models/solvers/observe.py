@@ -336,7 +336,7 @@ def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnk
     if run.points is not None:
         motions, since = places.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0])
         rows = partial(_rows, places, motions)
-        return ArtefactReading(run.points, run.setup, known, run.axes_mm, places.deviation_mm(motions), rows, since)
+        return ArtefactReading(run.points, run.setup, known, run.axes_mm, places.deviation_mm(motions), rows, since, run.t_s)
     assert run.centre_mm is not None
     cup = AxisPlaces.of(machine, terms, run.centre_mm[None], np.zeros((1, 3)))
     return _Bar(run, places, known, places.motions(theta), cup, cup.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0]))

@@ -11,9 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.paths import DIAGONALS, step_diagonal
+from abbe.models.solvers.artefact import LEARNED
+from abbe.models.solvers.artefact_faults import ArtefactFault, seen, undone
 from abbe.models.solvers.assessment import map_against_prior
 from abbe.models.solvers.helix import HelixSolution, fit_run
-from abbe.models.solvers.joint import JointSolution, Model, implausible, solve_joint
+from abbe.models.solvers.joint import JointSolution, Model, implausible, settled_points, solve_joint
 from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
 from abbe.models.solvers.observe import setup_unknowns
 from abbe.models.solvers.priors import U_WAVELENGTH, Priors
@@ -116,12 +118,19 @@ def solve_runs(
     data = tuple(run_data(r) for r in used)
     inputs = laser_inputs(instruments or {})
     priors = replace(Priors(), laser_scale=inputs.u_wavelength)
-    lengths = calibrated_lengths(used)
-    joint = solve_joint(site.machine, (*data, *lengths), model=model, priors=priors, progress=progress)
-    if beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else ""):
+    lengths, faults = calibrated_lengths(used), list[ArtefactFault]()
+    points = (*data, *lengths)
+    if all(r.is_artefact for r in used):
+        progress("points of artefacts: features, poses, motions")
+        points, faults = undone(points, lambda runs: settled_points(site.machine, runs, priors))
+    joint = solve_joint(site.machine, points, model=model, priors=priors, progress=progress)
+    if not all(r.is_artefact for r in used) and (
+        beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else "")
+    ):
         flags.append(beyond)
-        joint = solve_joint(site.machine, (*data, *lengths), model="rigid6", priors=priors, progress=progress) if free else joint
-    flags += check_instruments(joint, (*data, *lengths))
+        joint = solve_joint(site.machine, points, model="rigid6", priors=priors, progress=progress) if free else joint
+    flags += check_instruments(joint, points)
+    flags += [CampaignIssue(f.run, f.what, f.done, False) for f in (*faults, *seen(joint))]
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     digests = {r.run_id: measured_digest(r) for r in used}
@@ -227,7 +236,9 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
         The message states the set-up unknown and the size of its error.
     """
     setup = setup_unknowns(data, Priors())
-    found = implausible(joint, dict(zip(setup.names, (float(v) for v in setup.prior_sd), strict=True)))
+    own = tuple(f"{kind}_" for kind in (*LEARNED, "stylus", "shear", "scale"))  # of artefacts: found by `seen`, or free
+    sizes = {n: float(v) for n, v in zip(setup.names, setup.prior_sd, strict=True) if not n.startswith(own)}
+    found = implausible(joint, sizes)
     hard = [(name, times) for name, times in found if name.startswith(CALIBRATED)]
     if hard:
         name, times = hard[0]

@@ -75,7 +75,8 @@ def deviation_text(found: Assessment, points_mm: F2) -> str:
     notes = [f"# verdict: {solution_verdict(found).word}"]
     if only_artefacts(found.joint):
         deviation, expanded, frame = deviation_of_artefacts(found.joint, points_mm)
-        notes = [f"# frame: {frame}", *notes]
+        found_faults = "; ".join(flag.line for flag in found.solved.flags)
+        notes = [f"# frame: {frame}", f"# verdict: {found_faults}" if found_faults else notes[0]]
     else:
         p = found.predict(points_mm)
         deviation, expanded = p.deviation_mm, p.expanded_mm

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import pytest
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.solvers.artefact import ArtefactPoints
+from abbe.models.solvers.artefact_faults import relabelled, turned_run
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, run_jacobian, setup_unknowns
 from abbe.models.solvers.priors import Priors
@@ -34,7 +36,7 @@ def points(source: str, *, wall: bool = False) -> RunData:
     )  # type: ignore[arg-type] # fmt: skip
     at = np.array([300.0, 150.0, 100.0]) + nominal @ TURNED.T
     sign = np.sign(np.sin(np.arange(n * 3)).reshape(n, 3))
-    return RunData("r1", "s1", "artefact", at, np.zeros(n), sign, 10.0 * np.arange(n), np.ones(n), points=p)
+    return RunData("r1", "s1", "artefact", at, np.zeros(n), sign, 10.0 * np.repeat(np.arange(4), 3), np.ones(n), points=p)
 
 
 @pytest.mark.parametrize(("source", "wall"), [("probe", False), ("probe", True), ("cmm", False), ("cmm", True), ("length", False)])
@@ -62,3 +64,40 @@ def test_a_probed_point_reads_against_the_machine_and_a_made_one_with_it() -> No
         moved[source] = predict(MACHINE, TERMS, run, setup, theta) - predict(MACHINE, TERMS, run, setup, 0.0 * theta)
     assert moved["probe"] == pytest.approx(-moved["cmm"], rel=1e-3, abs=1e-9)
     assert np.abs(moved["cmm"]).max() > 1e-3
+
+
+def test_points_at_the_place_of_another_feature_get_its_name() -> None:
+    """A and B carry each other's label: they were found 60 mm from their nominal places."""
+    run = points("probe")
+    assert run.points is not None
+    at = {f: np.array(n) for f, n in PLACES.items()}
+    swapped = tuple({"A": "B", "B": "A"}.get(f, f) for f in run.points.feature)
+    nominal = np.array([at[f] for f in swapped])
+    found = (run.points.nominal_mm - nominal)[np.arange(12), run.points.component] + 0.02
+    wrong = replace(run, deviation_mm=found, points=replace(run.points, feature=swapped, nominal_mm=nominal))
+    (mended,), faults = relabelled((wrong,))
+    assert mended.points is not None
+    assert mended.points.feature == run.points.feature
+    assert mended.deviation_mm == pytest.approx(0.02)
+    assert [f.what for f in faults] == ["the labels of features A and B are exchanged"]
+
+
+def test_a_quarter_turn_keeps_what_was_read_and_tells_it_of_another_feature() -> None:
+    """The machine read the same shift in its own axes; the artefact's axes and features turn under it."""
+    run = points("probe")
+    assert run.points is not None
+    flat = {"A": [0.0, 0.0, 0.0], "B": [60.0, 0.0, 0.0], "C": [60.0, 60.0, 0.0], "D": [0.0, 60.0, 0.0]}
+    p = replace(run.points, nominal_mm=np.array([flat[f] for f in run.points.feature]))
+    plain = replace(run, points=p, deviation_mm=np.arange(12.0))
+    turned = turned_run(plain, 1)
+    assert turned is not None
+    assert turned.points is not None
+    assert turned.points.feature[:3] != p.feature[:3]
+    before = plain.deviation_mm[:, None] * p.matrix.T[p.component]
+    after = turned.deviation_mm[:, None] * turned.points.matrix.T[turned.points.component]
+    assert after == pytest.approx(before)
+    back = turned_run(turned, 3)
+    assert back is not None
+    assert back.points is not None
+    assert back.points.feature == p.feature
+    assert back.deviation_mm == pytest.approx(plain.deviation_mm)

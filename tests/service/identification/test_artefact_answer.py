@@ -57,3 +57,39 @@ def test_the_points_are_kept_in_the_database_as_they_were(tmp_path: Path) -> Non
     assert done.exit_code == 0, done.output
     for name in ("campaign.json", "p1.json", "p4.json"):
         assert json.loads((tmp_path / "out" / name).read_text()) == json.loads((folder / name).read_text())
+
+
+def _spoil(folder: Path, fault: str) -> None:
+    """Change one run of a campaign as such a fault would."""
+    path = folder / "p2.json"
+    run = json.loads(path.read_text())
+    c = run["columns"]
+    if fault == "false trigger":
+        c["deviation_x_mm"][7] += 0.12
+    else:
+        c["deviation_x_mm"] = [d + 0.012 * (i >= 12) for i, d in enumerate(c["deviation_x_mm"])]
+    path.write_text(json.dumps(run))
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ("false trigger", "run p2: a false trigger at C2: the reading is off by 120 µm - left out"),
+        ("moved", "run p2: the artefact moved before point 13"),
+        ("rotated", "run p2: the artefact lay rotated by 90 degrees"),
+    ],
+)
+def test_a_fault_is_named_and_the_machine_found_nevertheless(tmp_path: Path, fault: str, words: str) -> None:
+    """One run of four is spoiled: the answer names it in its verdict, and its uncertainty covers what is left of four poses."""
+    campaign(tmp_path, turned="p2" if fault == "rotated" else "")
+    if fault != "rotated":
+        _spoil(tmp_path, fault)
+    found, u, notes = solved(tmp_path, tmp_path)
+    assert any(line.startswith("# verdict: ") and words in line for line in notes), notes
+    assert (np.abs(found - without_motion(error_mm(*GRID.T) * 1e3, scale=False)) < u).mean() > 0.9
+
+
+def test_a_good_campaign_is_not_blamed(tmp_path: Path) -> None:
+    """No fault, no words of one."""
+    _, _, notes = solved(campaign(tmp_path, seed=2), tmp_path)
+    assert not any("run p" in line for line in notes)
