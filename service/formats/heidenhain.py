@@ -18,7 +18,7 @@ from abbe.service.formats.model import AxisTable, Compensation
 from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_table
 
 LIMITS = FormatLimits(points=256, cross=True)
-SIGN = SignRule(-1, False, "by manual", False, "compensation value: −e; manuals differ (error or correction)")
+SIGN = SignRule(-1, False, "by manual", False, "compensation value: −e; manuals differ (error or correction), a public tool writes +e")
 WHAT = "Heidenhain .COM"
 POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"

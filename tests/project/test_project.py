@@ -164,3 +164,11 @@ def test_help_comes_at_once() -> None:
     loaded = {line.rpartition("|")[2].strip().partition(".")[0] for line in run.stderr.splitlines() if line.startswith("import time:")}
     assert "typer" in loaded
     assert not loaded & {"numpy", "scipy", "sqlalchemy", "alembic", "pydantic", "fastapi", "pymodbus", "serial", "aiomqtt", "structlog"}
+
+
+def test_every_row_of_what_you_own_names_a_test_that_exists() -> None:
+    lines = (ROOT / "docs" / "how-to" / "what-you-own.md").read_text(encoding="utf-8").splitlines()
+    rows = [line for line in lines if line.startswith("| ") and not line.startswith("| you own")]
+    named = [re.search(r"`(tests/[\w/]+\.py)` \|$", row) for row in rows]
+    assert len(rows) > 15
+    assert [row for row, found in zip(rows, named, strict=True) if found is None or not (ROOT / found.group(1)).is_file()] == []

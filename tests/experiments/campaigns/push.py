@@ -16,6 +16,7 @@ from pathlib import Path
 from tests.push.bench import Bench
 from tests.push.loading import edited, real
 from tests.push.mutants import MUTANTS
+from tests.push.one_bank import CASES as ONE_BANK
 from tests.push.races import DATABASES
 from tests.push.races import races as random_races
 from tests.push.random_kills import LIMIT_S
@@ -24,10 +25,13 @@ from tests.push.sweep import PAIRED, Count, doubles, first_violation, singles
 from tests.push.variants import VARIANTS
 from tests.scenarios.conftest import simulated
 
+SWEPT = (*PAIRED, *ONE_BANK[:2])
+"""Cases whose double faults are swept: two banks, and one table."""
+
 
 def _part(arguments: tuple[int, int, int, int]) -> Count:
     case, every, part, parts = arguments
-    return doubles(real(), PAIRED[case], every=every, part=(part, parts))
+    return doubles(real(), SWEPT[case], every=every, part=(part, parts))
 
 
 def sweep(every: int, jobs: int) -> int:
@@ -36,7 +40,7 @@ def sweep(every: int, jobs: int) -> int:
     print(f"single faults: {total.combinations} combinations, violated: {dict(total.violated)}", flush=True)  # noqa: T201
     parts = 24
     with ProcessPoolExecutor(jobs) as pool:
-        work = [(case, every, part, parts) for case in range(len(PAIRED)) for part in range(parts)]
+        work = [(case, every, part, parts) for case in range(len(SWEPT)) for part in range(parts)]
         for number, count in enumerate(pool.map(_part, work)):
             total.merge(count)
             print(f"{number + 1}/{len(work)}: {total.combinations} combinations, violated: {dict(total.violated)}", flush=True)  # noqa: T201

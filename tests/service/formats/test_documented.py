@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.errors import TableFileError
 from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Motions, ProductTable, correction_at
@@ -158,6 +159,39 @@ def test_fanuc_example_sums_up_as_drawn() -> None:
     assert _added(comp, -350.0, 1) == pytest.approx(0.002)
     assert _added(comp, 50.0, 1) == pytest.approx(0.002)
     assert form.write(comp, settings)[0].text == text
+
+
+FANUC_ROTARY = """%
+N03620Q1A4P10000
+N03621Q1A4P10000
+N03622Q1A4P10004
+N03623Q1A4P1
+N03624Q1A4P90000
+N03625Q1A4P360000
+N10001Q1P-1
+N10002Q1P-1
+N10003Q1P1
+%
+"""
+
+
+def test_fanuc_vector_of_a_rotary_table_has_our_increments_and_is_refused_as_a_table_of_x() -> None:
+    """formats-fields.md: errors 0, 3.6, 7.2, 3.6 arcsec in units of 0.001 deg are -1, -1, +1; here µm over 0, 90, 180, 270 mm."""
+    value = -1e-3 * np.array([0.0, 1.0, 2.0, 1.0])
+    form, settings = FORMATS["fanuc-pitch"], FormatSettings(reference_mm=(0.0, 0.0, 0.0), first_point=1)
+    text = form.write(Compensation((AxisTable("X", "X", 90.0 * np.arange(4), value, value),)), settings)[0].text
+    assert [line for line in text.splitlines() if line.startswith("N1")] == [line for line in FANUC_ROTARY.splitlines() if "N1000" in line]
+    with pytest.raises(TableFileError, match=r"P\.PRM:3: axis A4, expected A1 to A3"):
+        form.read((TextFile("P.PRM", FANUC_ROTARY),), settings)
+
+
+def test_siemens_files_of_a_public_tool_are_read() -> None:
+    """formats-fields.md: blanks around "=", signs, AX3 for the axis, and the measured error with its own sign."""
+    lines = ["$AA_ENC_COMP[0,0,AX3] = +0.0", "$AA_ENC_COMP[0,1,AX3] = +0.0012", "$AA_ENC_COMP_STEP[0,AX3] = 50.0"]
+    lines += ["$AA_ENC_COMP_MIN[0,AX3] = 0.0", "$AA_ENC_COMP_MAX[0,AX3] = 50.0", "$AA_ENC_COMP_IS_MODULO[0,AX3]  = 0"]
+    text = "\n".join(["%_N_AX_EEC_INI", "CHANDATA(1)", *lines, "M17"]) + "\n"
+    comp = FORMATS["siemens-eec"].read((TextFile("AX3.INI", text),), FormatSettings(axis_names=("AX1", "AX2", "AX3")))
+    assert (comp.tables[0].axis, comp.tables[0].forward_mm.tolist()) == ("Z", [0.0, -0.0012])
 
 
 CENTROID = """CNC10 TAB FILE VERSION 3
