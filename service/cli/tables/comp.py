@@ -128,6 +128,37 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     conclude(f"abbe comp import {quote(str(out))} --format {form} --solution {quote(solution)}", machine=machine, db=db)
 
 
+@comp.command("step")
+def write_step(
+    form: FormatOption,
+    out: Annotated[Path, typer.Option("--out", metavar="FILE", help="File; a new folder if the format has several.", show_default=False)],
+    axis: Annotated[str, typer.Option("--axis", help="Axis that is tested.")] = "X",
+    reference: ReferenceOption = None,
+    machine: MachineOption = None,
+    as_json: JsonOption = False,
+) -> None:
+    """Write the 10 µm step of a format, and say where to measure what before any real table is loaded."""
+    from abbe.models.machine import AXES
+    from abbe.service.compensation.comp_export import control_for, reference_of, settings_for, write_files
+    from abbe.service.errors import FormatRefused
+    from abbe.service.formats.registry import format_of
+    from abbe.service.formats.step import step_of
+
+    if axis not in AXES:
+        raise FormatRefused(f"--axis {axis!r}: expected X, Y or Z", "name the axis that is tested")
+    found, nominal, at = format_of(form), _machine(machine), reference_of(reference)
+    start = nominal.stroke_mm[:, 0] if at is None else at
+    step = step_of(found, nominal, AXES.index(axis), start)
+    settings = settings_for(control_for(form), nominal, start)
+    written = [str(p) for p in write_files(found.write(step.compensation, settings), out)]
+    if as_json:
+        print_json({"files": written, "place": step.place, "expected": step.expected})
+        return
+    typer.echo(f"wrote {', '.join(written)}\nload it instead of every other table; {step.place}: {step.expected}")
+    typer.echo("by the other way, and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table")
+    conclude(f"abbe comp export SOLUTION --format {form} --step-moved -10 --out tables", machine=machine)
+
+
 @comp.command("import")
 def import_tables(  # noqa: PLR0913 - one argument for each option
     file: Annotated[Path, typer.Argument(metavar="FILE", help="File, or folder with several files.", show_default=False)],

@@ -60,6 +60,7 @@ CASES: dict[str, Case] = {
         "STO-002",
     ),
     "comp import": Case("comp import tables# --format linuxcnc", "measure --recipe", "comp import none --format linuxcnc", "FMT-001"),
+    "comp step": Case("comp step --format mach4 --out step#", "comp export", "comp step --format none --out x", "TAB-001"),
     "comp drop": Case("comp drop", "measure --recipe", "comp drop none", "TAB-001", (0,), "tests/service/compensation/test_file_drop.py"),
     "comp commission": Case("comp commission", "runs", "comp commission", "SEQ-011", (0, 1), f"{SCENARIOS}/test_correct_command.py"),
     "comp propose": Case("comp propose", "comp diff", "comp propose none", "STO-002", (0, 1), f"{SCENARIOS}/test_proposals.py"),
