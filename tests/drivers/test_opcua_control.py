@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import socket
 import tomllib
 from collections.abc import AsyncIterator
@@ -19,6 +20,8 @@ from asyncua import Server, ua
 from abbe.drivers.api import Condition, only_listens
 from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, NotProved, WrongDevice
 from abbe.drivers.opcua_control import DRIVER, MM, UNECE, OpcUaControl, open_files
+from abbe.service.devices.session import open_session
+from tests.service.devices.test_second_controller import machine_with
 
 ROOT = Path(__file__).resolve().parents[2]
 X, Y, Z, MOVING, FILE = ("ns=2;s=" + name for name in ("X", "Y", "Z", "Moving", "Table"))
@@ -139,6 +142,20 @@ async def test_a_file_is_put_into_it_and_read_back(plant: Plant) -> None:
 def test_the_package_offers_it_by_its_scheme() -> None:
     offered = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["entry-points"]["abbe.drivers"]
     assert EntryPoint("opc.tcp", offered["opc.tcp"], "abbe.drivers").load() is DRIVER
+
+
+async def test_the_service_opens_it_as_a_control_that_is_only_listened_to(
+    plant: Plant, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    info = tmp_path / "site" / "abbe_opcua-1.0.dist-info"
+    info.mkdir(parents=True)
+    (info / "METADATA").write_text("Metadata-Version: 2.1\nName: abbe-opcua\nVersion: 1.0\n")
+    (info / "entry_points.txt").write_text("[abbe.drivers]\nopc.tcp = abbe.drivers.opcua_control:DRIVER\n")
+    monkeypatch.syspath_prepend(str(info.parent))
+    importlib.invalidate_caches()
+    async with open_session(machine_with(tmp_path, plant.asked()).urls, listening=True) as session:
+        assert only_listens(session.controller)
+        assert (await session.controller.status()).position_mm == (1.5, -20.0, 300.25)
 
 
 async def test_what_cannot_be_opened_is_named() -> None:

@@ -6,7 +6,7 @@ import asyncio
 import time
 import zlib
 from collections.abc import AsyncIterator, Callable
-from contextlib import asynccontextmanager
+from contextlib import asynccontextmanager, suppress
 from dataclasses import dataclass, field
 
 BANK_BYTES = 9600
@@ -133,8 +133,9 @@ async def serving(control: AcmeControl) -> AsyncIterator[AcmeControl]:
 
     async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         writers.append(writer)
-        while line := await reader.readline():
-            writer.write(f"{control.answer(line.decode())}\n".encode())
+        with suppress(ConnectionError):
+            while line := await reader.readline():
+                writer.write(f"{control.answer(line.decode())}\n".encode())
         writer.close()
 
     server = await asyncio.start_server(talk, "127.0.0.1", limit=1 << 20)

@@ -20,6 +20,16 @@ class OneTableControl(AcmeControl):
     number: int = 0
     guards: bool = True
     compares: bool = True
+    hangs_up_at: str = ""
+    from_number: int = 0
+    """Word of the request behind which the connection ends, once that many switches were executed."""
+
+    def answer(self, line: str) -> str:
+        said = super().answer(line)
+        if self.hangs_up_at and line.startswith(self.hangs_up_at) and self.number >= self.from_number:
+            self.hangs_up_at = ""
+            raise ConnectionError
+        return said
 
     def _state(self) -> str:
         return f"99 {int(self.acts)} {self.number}"

@@ -5,28 +5,35 @@ Nothing is written until its lower level was commissioned by name; then tables a
 
 from __future__ import annotations
 
+import asyncio
 import importlib
-from collections.abc import AsyncIterator
+import threading
+from collections.abc import AsyncIterator, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from abbe.drivers.api import BankState
+from abbe.drivers.errors import DriverError
 from abbe.drivers.tables import crc32
 from abbe.models.compensation.tables import NineTables
+from abbe.service.cli import run
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.commission_one_bank import commission_one_bank
 from abbe.service.compensation.proved_levels import check_level
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
+from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session, open_session
-from abbe.service.errors import DoorOpen, TableRefused
+from abbe.service.errors import DoorOpen, PushNotBegun, StillActive, TableMismatch, TableRefused
 from abbe.service.push.operations import Verdict
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from tests.drivers.acme.control import serving
 from tests.drivers.acme.one_table import OneTableControl
+from tests.patience import within
 from tests.service.devices.test_second_controller import RAW, machine_with
 
 
@@ -37,13 +44,17 @@ async def control() -> AsyncIterator[OneTableControl]:
 
 
 @pytest.fixture
-def site(control: OneTableControl, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Site:
+def driver_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     info = tmp_path / "site" / "acme_driver-1.0.dist-info"
     info.mkdir(parents=True)
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: acme-driver\nVersion: 1.0\n")
     (info / "entry_points.txt").write_text("[abbe.drivers]\nacme = tests.drivers.acme.one_table:DRIVER\n")
     monkeypatch.syspath_prepend(str(info.parent))
     importlib.invalidate_caches()
+
+
+@pytest.fixture
+def site(driver_installed: None, control: OneTableControl, tmp_path: Path) -> Site:
     return machine_with(tmp_path, f"acme://127.0.0.1:{control.port}")
 
 
@@ -123,3 +134,65 @@ async def test_it_is_not_commissioned_with_the_door_open(session, control, store
     with pytest.raises(DoorOpen):
         await commission_one_bank(session.controller, store, site)
     assert control.number == 0
+
+
+@pytest.mark.parametrize("word", ["switch", "write", "read"])
+async def test_a_line_that_breaks_while_tables_are_exchanged(control, store, site, word) -> None:
+    """The push ends without a table that acts, or with the old one; the next session puts the old one back."""
+    async with open_session(site.urls) as session:
+        await commission_one_bank(session.controller, store, site)
+        await push(session, store, site, better=True)
+        old = (await read_base(session.controller)).image
+        number = control.number
+
+        async def probe() -> Verdict:
+            raise AssertionError("nothing is measured")
+
+        wanted = WantedTable(tables(), await read_base(session.controller), 100, None, {})
+        pushing = Pushing(session.controller, store, site)
+        control.hangs_up_at, control.from_number = word, number + 1  # from the switching off on
+        with pytest.raises((StillActive, PushNotBegun, TableMismatch, DriverError)):
+            await pushing.bring(wanted, Questions(list, "a test", probe, probe))
+    assert (control.acts, control.hangs_up_at) == (False, "")
+    async with open_session(site.urls) as session:
+        await recover(session.controller, store, site)
+        assert (control.acts, (await read_base(session.controller)).image) == (True, old)
+
+
+@contextmanager
+def served_in_a_thread(control: OneTableControl) -> Iterator[None]:
+    """The command line has an event loop of its own."""
+    started, loops = threading.Event(), []
+
+    async def serve() -> None:
+        async with serving(control):
+            loops.append((asyncio.get_running_loop(), asyncio.Event()))
+            started.set()
+            await loops[0][1].wait()
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),))
+    thread.start()
+    assert started.wait(within(10))
+    try:
+        yield
+    finally:
+        loop, stop = loops[0]
+        loop.call_soon_threadsafe(stop.set)
+        thread.join(within(10))
+
+
+@pytest.mark.usefixtures("driver_installed")
+def test_its_level_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """Without the option it says what to ask for; with it the level is L1."""
+    monkeypatch.chdir(tmp_path)
+    control = OneTableControl(RAW)
+    with served_in_a_thread(control):
+        machine_with(tmp_path, f"acme://127.0.0.1:{control.port}")
+        words = ["comp", "commission", "--levels-only", "-m", "mill.toml"]
+        assert run(words) == 2
+        assert "commission that lower level by name: abbe comp commission --one-bank" in capsys.readouterr().err
+        assert run([*words, "--one-bank"]) == 0
+    said = capsys.readouterr().out
+    assert "level L1: attended pushes, nothing acts while tables are exchanged" in said
+    assert "can_disable" in said
+    assert control.acts
