@@ -17,7 +17,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.errors import FormatRefused
-from abbe.service.formats.files import FormatSettings, TextFile, integers, whole
+from abbe.service.formats.files import FormatSettings, TextFile, integers, short
 from abbe.service.formats.model import AxisTable, Compensation
 from abbe.service.formats.rules import NOTHING, FormatLimits, SignRule, check_kinds, check_table
 
@@ -27,6 +27,8 @@ WHAT = "Fanuc pitch error compensation"
 NAME = "PITCH.TXT"
 LAST_POINT = 1023
 BASE = 10000
+INPUT_UNIT_MM = 1e-3
+"""A length without a decimal point counts in this unit: 90000 is 90 (a public tool's file of a rotary table); 50.0 is 50 mm."""
 _PARAMETER = re.compile(r"N(\d{5})Q1((?:A\d+P[+-]?[\d.]+)+);?")
 _POINT = re.compile(r"N(1\d{4})(?:Q[01])?P([+-]?\d+);?")
 _VALUE = re.compile(r"A(\d+)P([+-]?[\d.]+)")
@@ -72,7 +74,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
         last = first + table.position_mm.size - 2
         found = {REFERENCE: first + at - 1, FIRST: first, LAST: last, MAGNIFICATION: settings.magnification}
         interval = float(np.ptp(table.position_mm)) / (table.position_mm.size - 1)
-        texts = {k: str(v) for k, v in found.items()} | {INTERVAL: whole(interval, 6)}
+        texts = {k: str(v) for k, v in found.items()} | {INTERVAL: short(interval, 6)}
         points += _points(np.diff(there), first, table.name, settings.largest_step)
         free = last + 1
         if table.directional:
@@ -141,7 +143,9 @@ def _parse(file: TextFile) -> _Data:
             data.point[number] = (int(m.group(2)), line)
         elif (m := _PARAMETER.fullmatch(bare)) is not None:
             for axis, value in _VALUE.findall(m.group(2)):
-                data.parameter[(int(m.group(1)), int(axis))] = (file.number(line, value, f"parameter {m.group(1)}"), line)
+                number, found = int(m.group(1)), file.number(line, value, f"parameter {m.group(1)}")
+                found *= INPUT_UNIT_MM if number == INTERVAL and "." not in value else 1.0
+                data.parameter[(number, int(axis))] = (found, line)
         elif bare:
             raise file.wrong(line, f"{text.strip()!r} is neither a parameter nor a point")
     if percent != 2:

@@ -8,6 +8,8 @@ control: export a table from the target control and compare. The sign of the val
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from abbe.models.arrays import F1
@@ -23,6 +25,8 @@ WHAT = "Heidenhain .COM"
 POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
 UNIT_MM = 1e-4
+_EQUAL = re.compile(r"DATUM:(\S+)\s+DISTANCE:(\S+)")
+"""Heading of an iTNC 530: equal distances in place of a column AXISPOS. Read, not written."""
 STEEPEST = 64
 """TNC 4xx: neighbouring values may differ by at most the spacing divided by this."""
 
@@ -126,7 +130,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def assigned(files: tuple[TextFile, ...]) -> list[tuple[str, TextFile]]:
-    """Return the axes and their .COM files by the active line of the .CMA; without a .CMA by the first letter of the names.
+    """Return the axes and their .COM files by the active line of the .CMA; without it by the last letter of the names (X.COM, AXIS_X.COM).
 
     Raises
     ------
@@ -135,7 +139,7 @@ def assigned(files: tuple[TextFile, ...]) -> list[tuple[str, TextFile]]:
     """
     by_name = {f.name.upper(): f for f in files}
     cma = next((f for n, f in by_name.items() if n.endswith(".CMA")), None)
-    names = {n[:1]: n for n in by_name if n.endswith(".COM")} if cma is None else _active(cma)
+    names = {n[-5:-4]: n for n in by_name if n.endswith(".COM")} if cma is None else _active(cma)
     for name in names.values():
         if name not in by_name:
             assert cma is not None
@@ -169,6 +173,10 @@ def _active(cma: TextFile) -> dict[str, str]:
 
 def _read_com(file: TextFile, axis: str) -> list[AxisTable]:
     columns, rows = body(file)
+    if (equal := _EQUAL.search(file.text.partition("\n")[0])) is not None and columns[:1] == ["NR"] and "AXISPOS" not in columns:
+        datum, distance = (file.number(1, w, "DATUM or DISTANCE") for w in equal.groups())
+        columns = ["NR", "AXISPOS", *columns[1:]]
+        rows = [(line, [*cells[:1], repr(datum + k * distance), *cells[1:]]) for k, (line, cells) in enumerate(rows)]
     if columns[:2] != ["NR", "AXISPOS"] or not set(columns[2:]) <= {"BACKLASH", *AXES} or not set(columns) & set(AXES):
         raise file.wrong(2, f"columns {' '.join(columns)}, expected NR AXISPOS [BACKLASH] and axes")
     if len(rows) > LIMITS.points:

@@ -107,6 +107,12 @@ class OneBankWorld(World):
         self.tables = self.p.one_bank.OneBankTables(self, chunk_words=CHUNK_WORDS)  # memory of one process
         return super().live(coroutine)
 
+    def step(self, kind: str) -> str:
+        """I18 counts from the last fault on, not from the beginning."""
+        fault = super().step(kind)
+        self.ops_since_quiet = 0 if fault else self.ops_since_quiet
+        return fault
+
     def request(self, kind: str, do: Any, garble: Any = None) -> Any:
         """As a driver reports it."""
         try:

@@ -148,7 +148,7 @@ def test_siemens_cross_example_comes_back_byte_for_byte() -> None:
 def test_fanuc_example_sums_up_as_drawn() -> None:
     """B-63980EN p. 100: points 33 to 49, reference at point 40; the sum at the reference is zero and the numbers come back."""
     numbers = [2, 1, 1, -2, 0, -1, 0, -1, 2, 1, 0, -1, -1, -2, 0, 1, 2]
-    head = ["%", "N03620Q1A1P40", "N03621Q1A1P33", "N03622Q1A1P49", "N03623Q1A1P1", "N03624Q1A1P50"]
+    head = ["%", "N03620Q1A1P40", "N03621Q1A1P33", "N03622Q1A1P49", "N03623Q1A1P1", "N03624Q1A1P50.0"]
     text = "\n".join([*head, *(f"N{10033 + k}Q1P{v}" for k, v in enumerate(numbers)), "%"]) + "\n"
     settings = FormatSettings(reference_mm=(0.0, 0.0, 0.0), first_point=33)
     form = FORMATS["fanuc-pitch"]
@@ -175,12 +175,27 @@ N10003Q1P1
 """
 
 
+LINEAR = """%
+N03620Q1A1P0
+N03621Q1A1P1
+N03622Q1A1P3
+N03623Q1A1P1
+N03624Q1A1P90000
+N10001Q1P-1
+N10002Q1P-1
+N10003Q1P1
+%
+"""
+
+
 def test_fanuc_vector_of_a_rotary_table_has_our_increments_and_is_refused_as_a_table_of_x() -> None:
     """formats-fields.md: errors 0, 3.6, 7.2, 3.6 arcsec in units of 0.001 deg are -1, -1, +1; here µm over 0, 90, 180, 270 mm."""
     value = -1e-3 * np.array([0.0, 1.0, 2.0, 1.0])
     form, settings = FORMATS["fanuc-pitch"], FormatSettings(reference_mm=(0.0, 0.0, 0.0), first_point=1)
     text = form.write(Compensation((AxisTable("X", "X", 90.0 * np.arange(4), value, value),)), settings)[0].text
     assert [line for line in text.splitlines() if line.startswith("N1")] == [line for line in FANUC_ROTARY.splitlines() if "N1000" in line]
+    linear = FORMATS["fanuc-pitch"].read((TextFile("P.PRM", LINEAR),), settings).tables[0]
+    assert linear.position_mm.tolist() == [0.0, 90.0, 180.0, 270.0]  # 90000 without a point is 90
     with pytest.raises(TableFileError, match=r"P\.PRM:3: axis A4, expected A1 to A3"):
         form.read((TextFile("P.PRM", FANUC_ROTARY),), settings)
 
@@ -192,6 +207,22 @@ def test_siemens_files_of_a_public_tool_are_read() -> None:
     text = "\n".join(["%_N_AX_EEC_INI", "CHANDATA(1)", *lines, "M17"]) + "\n"
     comp = FORMATS["siemens-eec"].read((TextFile("AX3.INI", text),), FormatSettings(axis_names=("AX1", "AX2", "AX3")))
     assert (comp.tables[0].axis, comp.tables[0].forward_mm.tolist()) == ("Z", [0.0, -0.0012])
+
+
+@pytest.mark.parametrize(
+    ("name", "head"),
+    [
+        ("AXIS-X.COM", "BEGIN AXIS-X.COM  DATUM:+0.0000 DISTANCE:+50.0000\nNR   X\n"),
+        ("AXIS_X.COM", "BEGIN AXIS_X.COM MM\nNR   AXISPOS       X\n"),
+    ],
+)
+def test_heidenhain_headings_of_two_controls_are_read(name: str, head: str) -> None:
+    """formats-fields.md: iTNC 530 states datum and distance, TNC 640 has a column of positions."""
+    positions = ["", "", ""] if "DATUM" in head else ["-0.0000 ", "50.0000 ", "100.0000 "]
+    rows = "".join(f"{k}  {p}{v}\n" for k, (p, v) in enumerate(zip(positions, ("0.0000", "-0.0100", "0.0020"), strict=True)))
+    comp = FORMATS["heidenhain"].read((TextFile(name, f"{head}{rows}[END]\n"),), SETTINGS)
+    assert (comp.tables[0].axis, comp.tables[0].position_mm.tolist()) == ("X", [0.0, 50.0, 100.0])
+    assert comp.tables[0].forward_mm.tolist() == [0.0, -0.010, 0.002]
 
 
 CENTROID = """CNC10 TAB FILE VERSION 3
