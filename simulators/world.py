@@ -36,7 +36,7 @@ class World:
         self.controller = Controller(geometry, lease_scale=scenario.speed)
         self.ballbar = BallbarDevice(self.draws, scenario.magnitudes, self.locate, clock_offset_us=BALLBAR_CLOCK_US)
         self.air = Air(scenario.seed)
-        self.laser = LaserDevice(self.draws, laser_sizes(scenario), self.air, self.locate)
+        self.laser = LaserDevice(self.draws, laser_sizes(scenario), self.air, self.locate, self.machine.turned)
         if self.hidden is not None:
             self.laser.too_much = self.hidden.laser_mm
             self.ballbar.too_much = self.hidden.bar_mm

@@ -9,7 +9,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.case import Case
 from abbe.models.effects.path import Path
-from abbe.models.geometry.bases import Term, smooth_terms, term_values
+from abbe.models.geometry.bases import Term, smooth_terms
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import LOST, AxisPlaces, SetupUnknowns, bar_length_name, linearise, predict
@@ -57,31 +57,14 @@ class Baseline:
         return np.concatenate([theta[:n], np.zeros(LOST), self.parts @ theta[n:]])
 
     def read(self, run: RunData, theta: F1) -> F1:
-        """Return the exact reading of a run, mm, shape (n,) (`abbe.models.solvers.observe`), with a mirror that turns with the tool."""
-        value = predict(self.machine, self.terms, run, self.setup, self._full(theta))
-        return value + self._turning(run) @ theta[: len(self.terms)]
+        """Return the exact reading of a run, mm, shape (n,) (`abbe.models.solvers.observe`)."""
+        return predict(self.machine, self.terms, run, self.setup, self._full(theta))
 
     def linear(self, run: RunData, theta: F1) -> tuple[F1, F2]:
         """Return the reading of a run, mm, shape (n,), and its derivative with respect to the unknowns, shape (n, p)."""
         value, jacobian = linearise(self.machine, self.terms, run, self.setup, self._full(theta))
-        n, turning = len(self.terms), self._turning(run)
-        return value + turning @ theta[:n], np.concatenate([jacobian[:, :n] + turning, jacobian[:, n + LOST :] @ self.parts], axis=1)
-
-    def _turning(self, run: RunData) -> F2:
-        """Change of a laser's reading as the plane mirror turns with the tool, per unit of each term, shape (n, terms).
-
-        On a step diagonal the point where the beam meets the mirror moves by up to one step; 50 mm times 20 urad is 1 um.
-        """
-        out = np.zeros((len(run.axes_mm), len(self.terms)))
-        if run.kind == "laser":
-            assert run.beam is not None
-            turns = [i for i, t in enumerate(self.terms) if t.component >= 3]
-            if turns:
-                lever = np.cross(run.beam, run.axes_mm - run.axes_mm[0])  # (e x beam).d = e.(beam x d)
-                chosen = tuple(self.terms[i] for i in turns)
-                values = term_values(chosen, run.axes_mm, self.machine.stroke_mm)
-                out[:, turns] = values * lever[:, [t.component - 3 for t in chosen]]
-        return out
+        n = len(self.terms)
+        return value, np.concatenate([jacobian[:, :n], jacobian[:, n + LOST :] @ self.parts], axis=1)
 
     def along(self, path: Path, run: RunData, theta: F1) -> Path:
         """Return the path with the actual direction of the bar in ``look``: the cup's offset and the machine's deviation turn the bar.

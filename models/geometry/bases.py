@@ -43,12 +43,15 @@ SMOOTH_ORDER = 12
 """Highest Legendre order of a smooth error motion; higher ones describe what is rough (`rough_terms`)."""
 ROUGH_ORDER = 36
 """Highest Legendre order of a translational error motion with its rough part: details of a twentieth of the stroke."""
+ROUGH_ANGLE_ORDER = 24
+"""The same of a rotational error motion."""
 
 
 @lru_cache(maxsize=1)
 def rough_terms() -> tuple[Term, ...]:
-    """Return the terms of the rough parts of the nine translational error motions: orders above `SMOOTH_ORDER`."""
-    return tuple(t for t in smooth_terms(ROUGH_ORDER) if t.order > SMOOTH_ORDER and t.component < 3)
+    """Return the terms of the rough parts of the 18 error motions: orders above `SMOOTH_ORDER`."""
+    highest = (ROUGH_ORDER, ROUGH_ANGLE_ORDER)
+    return tuple(t for t in smooth_terms(ROUGH_ORDER) if SMOOTH_ORDER < t.order <= highest[t.component >= 3])
 
 
 @lru_cache(maxsize=64)

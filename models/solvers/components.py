@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import SMOOTH_ORDER, Term
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.priors import LENGTHS, SMALLEST_BEND, SizeModel, with_length
+from abbe.models.solvers.priors import ENDS_SHARES, LENGTHS, SMALLEST_BEND, SizeModel, with_shapes
 
 I1 = NDArray[np.int64]
 KINDS = ("bar", "laser", "artefact")
@@ -30,10 +30,12 @@ NOISE_SD = 2.0
 LEAST_ETA = -8.0
 """Least log ratio of noise variance to expected one, a factor of 55 in the standard deviation and below any instrument's resolution.
 Readings without noise would drive it to minus infinity, and the normal equations beyond double precision."""
-IGNORANCE = 1.5
+IGNORANCE = 1.0
 """Ignorance alone makes the size of a motion at most this many times as large as documented (`cautious`)."""
-ROUGHER = 0.2
+ROUGHER = 0.0
 """A motion is taken less smooth than most probable by this many posterior standard deviations of its smoothness (`cautious`)."""
+CLEAR = 1.5
+"""Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25
 TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
@@ -290,11 +292,22 @@ def _moved(c: Components, step: F1, model: SizeModel) -> Components:
     return Components(new[: c.psi.size], new[c.psi.size :])
 
 
-def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
-    """`estimate` with the correlation length of the error motions too, by hill climbing over `LENGTHS` from the model's own length.
+def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
+    """`estimate` with the correlation length of the error motions too, and with the share of their variance at the ends of the strokes.
 
-    ``sums`` are those of the unknowns in units of their typical size.
+    The smaller share is taken only if the log evidence gains `CLEAR`: where nothing was measured near the ends, a wrong one costs more
+    than a wide one. ``sums`` are those of the unknowns in units of their typical size.
     """
+    usual, least = ENDS_SHARES
+    best = _fit_length(sums, with_shapes(model, model.length, usual), start)
+    if not model.blocks:
+        return best
+    other = _fit_length(sums, with_shapes(model, best[0].length, least), best[1].components)
+    return other if other[1].value > best[1].value + CLEAR else best
+
+
+def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
+    """`estimate` by hill climbing over `LENGTHS` from the model's own length."""
     at = LENGTHS.index(model.length)
     found = {at: estimate(sums.turned(model.root, model.turned), model, start)}
     models = {at: model}
@@ -304,7 +317,7 @@ def fit_length(sums: InformationSums, model: SizeModel, start: Components) -> tu
         while 0 <= at + way < len(LENGTHS):
             new = at + way
             if new not in found:
-                models[new] = with_length(model, LENGTHS[new])
+                models[new] = with_shapes(model, LENGTHS[new], model.ends)
                 found[new] = estimate(sums.turned(models[new].root, model.turned), models[new], found[at].components)
             if found[new].value <= found[at].value:
                 break

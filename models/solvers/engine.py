@@ -9,7 +9,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import DIRECTIONS, Term
+from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term
 from abbe.models.machine import Machine
 from abbe.models.solvers.components import (
     I1,
@@ -22,13 +22,14 @@ from abbe.models.solvers.components import (
     blend,
     cautious,
     estimate,
-    fit_length,
+    fit_shapes,
     folds,
     grams,
     posterior,
     sums,
     total,
 )
+from abbe.models.solvers.details import with_details
 from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
@@ -164,8 +165,10 @@ def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None,
 
 
 def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: InstrumentNoise) -> CampaignProblem:
-    """Linearise all runs about the perfect machine."""
+    """Linearise all runs about the perfect machine; with rough terms, details of the machine are unknowns, too."""
     setup = setup_unknowns(runs, priors, machine)
+    if any(t.order > SMOOTH_ORDER for t in terms):
+        setup = with_details(setup, runs, priors)
     rest = tuple(f"backlash_{a}" for a in DIRECTIONS) + setup.names
     rest_sd = np.concatenate([np.full(len(DIRECTIONS), priors.backlash_mm), setup.prior_sd])
     sizes = size_model(machine, terms, rest, rest_sd, priors)
@@ -192,7 +195,7 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
         z = (measured - problem.predicted(sizes.typical * x)) / problem.sigma + r.a @ x
         whole = total(sums(PlannedReadings(r.a, z, r.run, r.fold, r.kind), gram, weight))
         if step == 1 or (dirty and step == GENTLE):
-            sizes, found = fit_length(whole, sizes, c)
+            sizes, found = fit_shapes(whole, sizes, c)
             c = found.components
         elif step:
             c = estimate(whole.turned(sizes.root, sizes.turned), sizes, c).components

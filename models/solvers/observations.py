@@ -57,6 +57,10 @@ class RunData:
         Kind of test, for display and to compare runs; the reading depends only on ``kind`` and the positions.
     rejected : int
         Number of raw readings that `block_average` left out.
+    start_mm : array, shape (3,), optional, for a laser
+        Commanded position at which beam and mirror met at the functional point; None: the first position here.
+    mirror_turns : bool
+        Whether the laser's mirror is on the tool's side and turns with it; False: it stands on the workpiece's side, and the laser moves.
     """
 
     label: str
@@ -76,6 +80,8 @@ class RunData:
     points: ArtefactPoints | None = None
     test: Test = ""
     rejected: int = 0
+    start_mm: F1 | None = None
+    mirror_turns: bool = True
 
     def __post_init__(self) -> None:
         """Refuse data that no solver can use; the error names the run."""

@@ -1,9 +1,9 @@
 """Exact readings of a run from machine and set-up, and their derivatives (docs/explanation/conventions.md, "Readings").
 
 Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns. Nothing is linearised: rotations are
-finite, the bar's reading is a length, the mirror a tilted plane that a misaligned beam meets. Helix, circle in any plane and partial arc
-are the same ball-bar reading; step diagonal, plain diagonal and single-axis line are the same laser reading. Only the commanded positions
-differ.
+finite, the bar's reading is a length, the mirror a tilted plane that turns with the tool and that a misaligned beam meets. Helix, circle
+in any plane and partial arc are the same ball-bar reading; step diagonal, plain diagonal and single-axis line are the same laser reading.
+Only the commanded positions differ.
 
 Published methods (Yang and Kim; Wang) take the set-ups as perfect. Here each set-up error is an unknown with a documented prior
 (`abbe.models.solvers.priors`):
@@ -25,13 +25,14 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
-from functools import partial
+from functools import cached_property, partial
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2, F3, F4
 from abbe.models.geometry.bases import Term, layout_of, term_values
 from abbe.models.geometry.chain import exact_deviation_mm, exact_jacobian, motion_jacobian
+from abbe.models.geometry.rotation import turn_vector, turn_vector_slope
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.artefact import ArtefactReading
 from abbe.models.solvers.artefact import unknowns as artefact_unknowns
@@ -55,11 +56,16 @@ BAR_DIGITS = 2
 
 @dataclass(frozen=True)
 class SetupUnknowns:
-    """Names and prior standard deviations of a campaign's set-up unknowns; ``start_s``: first reading of each set-up but the laser's."""
+    """Names and prior standard deviations of a campaign's set-up unknowns.
+
+    ``start_s``: first reading of each set-up but the laser's. ``details``: what each laser run reads per unit of every set-up unknown
+    because of details of the machine (`abbe.models.solvers.details`), by label, shape (n, set-up).
+    """
 
     names: tuple[str, ...]
     prior_sd: F1
     start_s: Mapping[str, float] = field(default_factory=dict)
+    details: Mapping[str, F2] = field(default_factory=dict)
 
 
 def setup_unknowns(runs: tuple[RunData, ...], priors: Priors, machine: Machine | None = None) -> SetupUnknowns:
@@ -230,6 +236,10 @@ class AxisPlaces:
         """Evaluate the terms' functions at commanded positions (n, 3)."""
         return cls(machine, axes_mm, sign, term_values(terms, axes_mm, machine.stroke_mm), layout_of(terms).motion)
 
+    def first(self) -> AxisPlaces:
+        """The first place alone."""
+        return replace(self, axes_mm=self.axes_mm[:1], sign=self.sign[:1], values=self.values[:1])
+
     def motions(self, theta: F1) -> F3:
         """Error motions with squareness and lost motion, shape (n, 3 axes, 6), mm and rad; ``theta`` begins with terms and lost motion."""
         terms = self.values.shape[1]
@@ -252,9 +262,14 @@ class AxisPlaces:
             return motion_jacobian(self.machine, self.axes_mm)
         return exact_jacobian(self.machine, self.axes_mm, motions)
 
-    def rows(self, direction: F2, slope: F4) -> F2:
-        """Derivative of a reading in the given directions (n, 3) with respect to every term and lost motion, shape (n, terms + 3)."""
+    def rows(self, direction: F2, slope: F4, turn: F2 | None = None) -> F2:
+        """Derivative of a reading in the given directions (n, 3) with respect to every term and lost motion, shape (n, terms + 3).
+
+        ``turn`` (n, 3), mm: reading per rad of the tool's rotation, whichever carriage turns it.
+        """
         along = (direction[:, None, :] @ slope.reshape(-1, 3, 18))[:, 0, :]
+        if turn is not None:
+            along.reshape(-1, 3, 6)[:, :, 3:] += turn[:, None, :]
         lost = -0.5 * self.sign * along[:, [0, 7, 14]]
         return np.concatenate([self.values * along[:, self.column], lost], axis=1)
 
@@ -332,7 +347,7 @@ def _of(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnk
     known = _SetupValues({name: i for i, name in enumerate(setup.names)}, theta[n_machine:])
     places = AxisPlaces.of(machine, terms, run.axes_mm, run.sign)
     if run.kind == "laser":
-        return _Laser(run, places, known, places.motions(theta))
+        return _Laser(run, places, known, places.motions(theta), setup.details.get(run.label))
     if run.points is not None:
         motions, since = places.motions(theta), run.t_s - setup.start_s.get(run.setup, run.t_s[0])
         rows = partial(_rows, places, motions)
@@ -394,54 +409,88 @@ class _Bar:
 
 @dataclass(frozen=True)
 class _Laser:
-    """Laser reading (1 + scale) m.(P - P0) / (m.l) - nominal + zero + drift t: P actual mirror position, P0 the first, l the beam.
+    """Laser reading (1 + scale) (1 + cosine) m.(P - P0) / (m.n) - nominal + zero + drift t: P actual position, P0 the first, n the beam.
 
-    Normal of the mirror m = n + t1 e1 + t2 e2 with the nominal beam n and tilts as tangents, so that m.n = 1 and 1 / (m.l) = 1 + cosine.
+    Normal of the mirror m = R (n + t1 e1 + t2 e2) with the nominal beam n and tilts as tangents. A mirror on the spindle turns with the
+    tool, by R of the sum of all carriages' rotations, and off the beam this shows: 50 mm times 20 urad is 1 um (Chapman, Precision
+    Engineering 27 (2003) 401).
     """
 
     run: RunData
     places: AxisPlaces
     known: _SetupValues
     motions: F3
+    details: F2 | None
 
     def _names(self) -> tuple[list[str], str, str, str]:
         s, label = self.run.setup, self.run.label
         return [f"tilt_{s}_1", f"tilt_{s}_2"], f"cosine_{s}", f"zero_{label}", f"drift_{label}"
 
-    def _mirror(self) -> tuple[F1, F2, F1]:
-        """Mirror normal minus nominal beam direction, the two tilt directions, and the factors (1 + scale) and (1 + cosine)."""
-        tilt, cosine, _, _ = self._names()
+    @cached_property
+    def _beam(self) -> F1:
         assert self.run.beam is not None
-        across = perpendicular(self.run.beam)
-        return self.known.get(*tilt) @ across, across, 1.0 + self.known.get("laser_scale", cosine)
+        return self.run.beam
 
-    def _moved(self) -> tuple[F2, F2]:
-        """Nominal displacement since the first record and the change of the machine's deviation, shape (n, 3) each, mm."""
+    @cached_property
+    def _factors(self) -> F1:
+        """(1 + scale) and (1 + cosine)."""
+        return 1.0 + self.known.get("laser_scale", self._names()[1])
+
+    @cached_property
+    def _mirror(self) -> F1:
+        """Normal of the mirror where nothing turns it, shape (3,)."""
+        return self._beam + self.known.get(*self._names()[0]) @ perpendicular(self._beam)
+
+    @cached_property
+    def _rotation(self) -> F2 | None:
+        """Rotation of the mirror, shape (n, 3), rad; None: it does not turn."""
+        return self.motions[:, :, 3:].sum(axis=1) if self.run.mirror_turns else None
+
+    def _turned(self, vector: F1) -> F2:
+        """Directions of a vector of the mirror, shape (n, 3)."""
+        vectors = np.broadcast_to(vector, self.run.axes_mm.shape)
+        return vectors if self._rotation is None else vectors + turn_vector(self._rotation, vectors)
+
+    @cached_property
+    def _path(self) -> tuple[F2, F2, F1, F1]:
+        """Nominal place since the zero; normal / (m.n), both (n, 3); nominal path and what the mirror adds to it, both (n,), mm."""
+        axes_mm = self.run.axes_mm
+        nominal = axes_mm - (axes_mm[0] if self.run.start_mm is None else self.run.start_mm)
         deviation = self.places.deviation_mm(self.motions)
-        return self.run.axes_mm - self.run.axes_mm[0], deviation - deviation[0]
+        added, normal = deviation - deviation[0], self._turned(self._mirror)
+        normal = normal / (normal @ self._beam)[:, None]
+        along = nominal @ self._beam
+        apart = ((nominal - np.outer(along, self._beam) + added) * normal).sum(axis=1)  # without the nominal metre, to keep all digits
+        return nominal + added, normal, along, apart
 
     def reading(self) -> F1:
-        assert self.run.beam is not None
-        lean, _, factors = self._mirror()
-        nominal, added = self._moved()
-        _, _, zero, drift = self._names()
-        values = self.known.get(zero, drift)
-        factor = factors.prod()
-        apparent_mm = nominal @ lean + added @ (self.run.beam + lean)  # without the nominal metre, to keep all digits
-        return np.asarray((factor - 1.0) * (nominal @ self.run.beam) + factor * apparent_mm + values[0] + values[1] * self._since_s())
+        _, _, along, apart = self._path
+        zero, drift = self.known.get(*self._names()[2:])
+        factor = self._factors.prod()
+        shown = (factor - 1.0) * (along - along[0]) + factor * (apart - apart[0]) + zero + drift * self._since_s()
+        return np.asarray(shown if self.details is None else shown + self.details @ self.known.values)
 
     def jacobian(self) -> F2:
-        assert self.run.beam is not None
-        lean, across, factors = self._mirror()
-        mirror, (nominal, added) = self.run.beam + lean, self._moved()
-        n = len(nominal)
-        rows = self.places.rows(np.broadcast_to(factors.prod() * mirror, (n, 3)), self.places.slope(self.motions))
+        moved, normal, along, apart = self._path
+        n, factor, slope = len(along), self._factors.prod(), self.places.slope(self.motions)
         tilt, cosine, zero, drift = self._names()
-        path = nominal + added
+        seen = along + apart
+        across = (moved - np.outer(seen, self._beam)) / (self._turned(self._mirror) @ self._beam)[:, None]  # per change of the normal
+        turn = None
+        if self._rotation is not None:
+            turn = factor * (across[:, None, :] @ turn_vector_slope(self._rotation, np.broadcast_to(self._mirror, (n, 3))))[:, 0]
+        rows = self.places.rows(factor * normal, slope, turn)
+        first = self.places.first()
+        rows -= factor * normal @ first.rows(np.eye(3), np.repeat(slope[:1], 3, axis=0))
+        if turn is not None and turn[0].any():
+            rows -= first.rows(np.zeros((1, 3)), slope[:1], turn[:1])
         parts = {zero: np.ones(n), drift: self._since_s()}
-        parts |= {"laser_scale": factors[1] * (path @ mirror), cosine: factors[0] * (path @ mirror)}
-        parts |= {name: factors.prod() * (path @ across[k]) for k, name in enumerate(tilt)}
-        return np.concatenate([rows - rows[0], self.known.columns(parts, n)], axis=1)
+        parts |= {"laser_scale": self._factors[1] * (seen - seen[0]), cosine: self._factors[0] * (seen - seen[0])}
+        for name, direction in zip(tilt, perpendicular(self._beam), strict=True):
+            leans = factor * (across * self._turned(direction)).sum(axis=1)
+            parts[name] = leans - leans[0]
+        columns = self.known.columns(parts, n)
+        return np.concatenate([rows, columns if self.details is None else columns + self.details], axis=1)
 
     def _since_s(self) -> F1:
         return np.asarray(self.run.t_s - self.run.t_s[0])

@@ -38,7 +38,8 @@ class Priors:
     positioning_mm, straightness_mm : one Legendre coefficient of order 2 and more.
     angle_rad, angle_slope_rad : one coefficient of order 2 and more; of order 1.
     decay_order : coefficients fall with the order as 1 / (1 + (order / decay_order)^2), because machine errors are smooth.
-    rough_mm : rough part of a translational motion (orders above `SMOOTH_ORDER`): pitch of a screw, joints of rails, wear.
+    rough_mm, rough_rad : rough part of a translation, of a rotation (orders above `SMOOTH_ORDER`): joints of rails, wear.
+    detail_mm : what no order follows at a place of a step test, as of the lead of a screw (`abbe.models.solvers.details`).
     backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; error of a laser run's first record; drift of
         a laser run.
     bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (set with a
@@ -59,6 +60,8 @@ class Priors:
     angle_slope_rad: float = 20e-6
     decay_order: float = 6.0
     rough_mm: float = 1e-3
+    rough_rad: float = 3e-6
+    detail_mm: float = 1e-3
     backlash_mm: float = 10e-3
     cup_mm: float = 60e-3
     bar_length_mm: float = 2e-3
@@ -109,19 +112,20 @@ MOTION_FACTOR = 2.5
 """Hyperprior of the size of one error motion relative to its class: known within this factor."""
 LARGEST_MOTION = 5.0
 """One error motion is never estimated more than this many times as large as its class."""
+SMALLEST_SIZE = 0.07
 SMOOTHNESS_SD = 0.7
 """Hyperprior of how much faster than documented the sizes of one motion fall with the order; never slower (`SizeModel.low`)."""
 ORDER_SD, LEAST_ORDER, LARGEST_ORDER = 1.0, -6.0, 1.0
 """Hyperprior and bounds of the log variance of one order, common to all motions: a little larger than documented, or almost nothing."""
-LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift", *LEARNED)
+LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift", "detail", *LEARNED)
 """Set-up unknowns from mounting and temperature, whose typical size is estimated from the data; that of calibrations is not."""
 LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
 """Correlation lengths of the error motions that are tried, in strokes: 0.1 to 1.35."""
 FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
 """How much the correlation lengths of one machine's motions differ: standard deviation of the logarithm, a factor of 1.5."""
-ENDS_SHARE = 0.1
-"""Share of a motion's variance that is largest at the ends of the stroke: guideways sag and screws bend most there."""
+ENDS_SHARES = (0.1, 0.03)
+"""Share of a motion's variance that is largest at the ends of the stroke, where guideways sag and screws bend most: usual, and least."""
 ROUGH_LENGTH_MM = 30.0
 """Correlation length of the rough part of a translational motion: between the pitch of a screw and the carriage's length."""
 SMALLEST_BEND = 0.003
@@ -133,11 +137,11 @@ NODES = 160
 
 
 @cache
-def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
+def smooth_shapes(order: int, length: float, ends: float = ENDS_SHARES[0]) -> tuple[F2, F1]:
     """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
     The coefficients are those of a stationary process with Matern 3/2 correlation of about ``length`` strokes, log-normal with
-    `LENGTH_SPREAD`, and with `ENDS_SHARE` of its variance in independent coefficients, which are largest at the ends. A smoother
+    `LENGTH_SPREAD`, and with the share ``ends`` of its variance in independent coefficients, which are largest at the ends. A smoother
     correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would then tell its ends. The shapes are
     the eigenvectors of the coefficients' covariance.
 
@@ -154,8 +158,8 @@ def smooth_shapes(order: int, length: float) -> tuple[F2, F1]:
     process = _projected(np.einsum("s,sij->ij", share, (1.0 + scaled) * np.exp(-scaled)), 2, order)
     k = np.arange(2, order + 1)
     fade = (1.0 + (k / Priors().decay_order) ** 2) ** -2.0
-    ends = fade / (fade / (2.0 * k + 1.0)).sum()
-    values, vectors = np.linalg.eigh((1.0 - ENDS_SHARE) * process + ENDS_SHARE * np.diag(ends))
+    at_ends = np.diag(fade / (fade / (2.0 * k + 1.0)).sum())
+    values, vectors = np.linalg.eigh((1.0 - ends) * process + ends * at_ends)
     values, vectors = values[::-1], vectors[:, ::-1]
     vectors = vectors * np.sign(vectors[np.argmax(np.abs(vectors), axis=0), np.arange(k.size)])
     return np.asarray(vectors), np.maximum(values, SMALLEST_SHARE * values[0])
@@ -195,8 +199,8 @@ class SizeModel:
         (`smooth_shapes`) and per rough part (`rough_root`), elsewhere the unit matrix.
     blocks, rough : tuple of arrays of int
         Unknowns of each error motion of order 2 to `SMOOTH_ORDER`; of each rough part, the orders above.
-    length : float
-        Correlation length of the error motions, strokes.
+    length, ends : float
+        Correlation length of the error motions, strokes; share of their variance at the ends of the strokes.
     names : tuple of str
         Meaning of each number of psi: log variance of a class of unknowns relative to the documented one, of one error motion relative to
         its class, smoothness of one motion, size of one order in all motions.
@@ -210,6 +214,7 @@ class SizeModel:
     blocks: tuple[NDArray[np.intp], ...]
     rough: tuple[NDArray[np.intp], ...]
     length: float
+    ends: float
     names: tuple[str, ...]
     design: F2
     sd: F1
@@ -242,7 +247,8 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
     rough, root = _rough_parts(machine, terms, motion.size)
     typical = np.concatenate([_reference(machine, terms, priors), rest_sd])
     names = tuple(n.name for n in numbers)
-    return with_length(SizeModel(typical, root, blocks, rough, FIRST_LENGTH, names, design, sd, low, high), FIRST_LENGTH)
+    model = SizeModel(typical, root, blocks, rough, FIRST_LENGTH, ENDS_SHARES[0], names, design, sd, low, high)
+    return with_shapes(model, FIRST_LENGTH, ENDS_SHARES[0])
 
 
 MACHINE_SIZE = (2.0 * np.log(5.0), -2.0 * np.log(40.0), 2.0 * np.log(5.0))
@@ -260,7 +266,7 @@ class _Number(NamedTuple):
 def _classes(kinds: list[str]) -> list[_Number]:
     """Size of every class; a set-up may be better than usual by any factor, because its unknowns are no shapes that could explode."""
     high = 2.0 * np.log(LARGEST_SIZE)
-    low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else -high for k in kinds}
+    low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else 2.0 * np.log(SMALLEST_SIZE) for k in kinds}
     bounds = {k: (2.0 * np.log(SIZE_FACTOR), low[k], high) for k in kinds}
     return [_Number(k, np.array([float(v == k) for v in kinds]), bounds[k]) for k in dict.fromkeys(kinds) if k]
 
@@ -288,13 +294,13 @@ def _rough_parts(machine: Machine, terms: tuple[Term, ...], p: int) -> tuple[tup
     return parts, root
 
 
-def with_length(model: SizeModel, length: float) -> SizeModel:
-    """Return the size model with another correlation length of the error motions, strokes."""
+def with_shapes(model: SizeModel, length: float, ends: float) -> SizeModel:
+    """Return the size model with another correlation length of the error motions, strokes, and share of variance at the ends."""
     root = model.root.copy()
     for at in model.blocks:
-        shapes, variance = smooth_shapes(at.size + 1, length)
+        shapes, variance = smooth_shapes(at.size + 1, length, ends)
         root[np.ix_(at, at)] = shapes * np.sqrt(variance)
-    return replace(model, root=root, length=length)
+    return replace(model, root=root, length=length, ends=ends)
 
 
 def _reference(machine: Machine, terms: tuple[Term, ...], p: Priors) -> F1:
@@ -305,7 +311,7 @@ def _reference(machine: Machine, terms: tuple[Term, ...], p: Priors) -> F1:
 def _bend_size(term: Term, p: Priors) -> float:
     """Prior standard deviation of an error motion at a point of its stroke, mm or rad."""
     if term.order > SMOOTH_ORDER:
-        return p.rough_mm
+        return p.rough_mm if term.component < 3 else p.rough_rad
     if term.component >= 3:
         return p.angle_rad
     return p.positioning_mm if term.component == term.axis else p.straightness_mm
@@ -315,7 +321,7 @@ def _class(term: Term) -> str:
     if term.order == 0:
         return ""
     if term.order > SMOOTH_ORDER:
-        return "rough"
+        return "rough" if term.component < 3 else "rough angle"
     if term.component >= 3:
         return "slope" if term.order == 1 else "angle"
     if term.component == term.axis:

@@ -166,9 +166,6 @@ def _active(cma: TextFile) -> dict[str, str]:
     if len(active) != 1:
         raise cma.wrong(active[1] if active else 3, f"{len(active)} lines are active, expected one")
     head, row = lines[1][1], lines[active[0] - 1][1]
-    strange = next((c for c in columns if c in AXES and f" {c}" not in head), None)
-    if strange is not None:
-        raise cma.wrong(2, f"column {strange} is not behind a blank: {head!r}")
     at = {c: head.index(f" {c}") + 1 for c in columns if c in AXES}  # columns are located by their position, because cells may be empty
     found = {c: row[k : k + 12].strip().rstrip("*").strip().upper() for c, k in at.items()}
     return {c: v for c, v in found.items() if v}

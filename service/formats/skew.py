@@ -173,7 +173,7 @@ def _read_klipper(file: TextFile, line: int, text: str, found: dict[str, float])
             raise file.wrong(line, f"{word} is not XY, XZ or YZ with three lengths")
         try:
             found[plane.lower()] = factor_of(*values)
-        except (ValueError, ArithmeticError):
+        except (ValueError, ZeroDivisionError):
             raise file.wrong(line, f"{word}: no figure has these lengths") from None
 
 

@@ -12,7 +12,8 @@ from abbe.models.compensation.grid import GridTable, compensable_nodes, grid_tab
 from abbe.models.geometry.volume import volume_frame
 from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
-from abbe.models.uncertainty.prediction import worst_point
+from abbe.models.uncertainty.prediction import predict_deviation, worst_point
+from abbe.models.uncertainty.sources import error_sources
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
 from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts
@@ -78,7 +79,8 @@ def deviation_text(found: Assessment, points_mm: F2) -> str:
         found_faults = "; ".join(flag.line for flag in found.solved.flags)
         notes = [f"# frame: {frame}", f"# verdict: {found_faults}" if found_faults else notes[0]]
     else:
-        p = found.predict(points_mm)
+        sources = error_sources(found.joint, found.solved.inputs.as_measured())
+        p = predict_deviation(sources, points_mm, frame=volume_frame(found.joint.machine))
         deviation, expanded = p.deviation_mm, p.expanded_mm
     rows = zip(points_mm, np.column_stack([deviation, expanded]) * 1e3, strict=True)
     lines = [",".join([*(f"{v:.10g}" for v in at), *("" if np.isnan(v) else f"{v:.6g}" for v in values)]) for at, values in rows]

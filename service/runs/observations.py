@@ -125,7 +125,9 @@ def _run_data(run: Run, blocks: int) -> RunData:
     }
     read = columns.readings_mm[valid]
     if isinstance(setup, LaserSetup):
-        return RunData(kind="laser", **common, deviation_mm=_since_first(read, first_valid=bool(valid[0])), beam=run.beam)
+        start = columns.q_mm[0] if np.isfinite(columns.q_mm[0]).all() else None  # the zero was taken there, valid record or not
+        read = _since_first(read, first_valid=bool(valid[0]))
+        return RunData(kind="laser", **common, deviation_mm=read, beam=run.beam, start_mm=start)
     common |= {"u_length_mm": setup.u_length_mm, "length_calibrated": setup.length_calibrated}
     return block_average(RunData(kind="bar", **common, deviation_mm=read, centre_mm=setup.centre_mm, radius_mm=setup.radius_mm), blocks)
 

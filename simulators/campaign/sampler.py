@@ -116,7 +116,7 @@ class Rig:
         times = self._times(len(axes_mm), 2.0, t_s)
         where = self._locate(times, axes_mm, tool_mm)
         mount = Mount(true_beam / np.linalg.norm(true_beam), normal, where[0])
-        path = np.array([mount.displacement(p) for p in where]) * (1.0 + self.wavelength_error)
+        path = mount.displacement(where, self.machine(tool_mm).turned(axes_mm)) * (1.0 + self.wavelength_error)
         return self._read(path - (axes_mm - axes_mm[0]) @ nominal, self.conditions.laser_noise_mm)
 
     def _locate(self, times_s: F, axes_mm: F, tool_mm: F | None) -> F:

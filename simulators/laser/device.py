@@ -9,12 +9,15 @@ import numpy as np
 from abbe.simulators.arrays import F
 from abbe.simulators.scenario import Magnitudes
 from abbe.simulators.truth.draws import STREAM_LASER_NOISE, STREAM_MIRROR, Draws, generator
+from abbe.simulators.truth.machine import rotate
 from abbe.simulators.truth.surroundings import Air, AirState
 
 RATE_HZ = 20
 
 Locate = Callable[[F, F], F]
 """Maps times (n,) s and axis positions (n, 3) mm to actual tool positions (n, 3) mm."""
+Turned = Callable[[F], F]
+"""Maps axis positions (n, 3) mm to rotations of the tool against the workpiece (n, 3) rad."""
 
 
 class LaserResult(IntEnum):
@@ -39,22 +42,27 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Laser and mirror as set up: unit ``beam`` (true, away from the laser), ``normal`` of the mirror, zero position (mm)."""
+    """Laser and mirror as set up: unit ``beam`` (true, away from the laser), ``normal`` of the mirror unturned, zero position (mm)."""
 
     beam: F
     normal: F
     zero_mm: F
 
-    def displacement(self, position_mm: F) -> float:
-        """Return how far the point where the true beam meets the mirror plane has moved along the beam since the zero, mm."""
-        return float(self.normal @ (position_mm - self.zero_mm) / (self.normal @ self.beam))
+    def displacement(self, position_mm: F, turned_rad: F) -> F:
+        """Return how far the points where the true beam meets the mirror plane are from the zero along the beam, (n,) mm.
+
+        ``position_mm``, ``turned_rad`` (n, 3): place and rotation of the tool, with which the mirror turns.
+        """
+        normal = rotate(turned_rad, np.broadcast_to(self.normal, position_mm.shape))
+        along: F = np.einsum("ij,ij->i", normal, position_mm - self.zero_mm) / (normal @ self.beam)
+        return along
 
 
 class LaserDevice:
     """Makes one output sample every 1/20 s of its own time; samples are computed when read."""
 
-    def __init__(self, draws: Draws, sizes: Magnitudes, air: Air, locate: Locate) -> None:
-        self._draws, self._sizes, self._air, self._locate = draws, sizes, air, locate
+    def __init__(self, draws: Draws, sizes: Magnitudes, air: Air, locate: Locate, turned: Turned) -> None:
+        self._draws, self._sizes, self._air, self._locate, self._turned = draws, sizes, air, locate, turned
         self._mount: Mount | None = None
         self._mounts = 0
         self._signal = 0
@@ -92,10 +100,10 @@ class LaserDevice:
         output = replace(self._output, count=count, time_s=time_s, air=air, signal_permille=self._signal_now(), status=self._status())
         if self._mount is None or self._lost or not self._zeroed:
             return output
-        position = self._locate(np.array([time_s]), axes_mm[None, :])[0]
+        position = self._locate(np.array([time_s]), axes_mm[None, :])
         # one generator per sample: a reading does not depend on which other samples were read
         noise = generator(self._draws.seed, STREAM_LASER_NOISE, count).normal() * self._draws.laser_noise_mm
-        path = self._mount.displacement(position)
+        path = float(self._mount.displacement(position, self._turned(axes_mm[None, :]))[0])
         if not self._compensating:
             path *= 1.0 + air.refractivity
         if self.too_much is not None:

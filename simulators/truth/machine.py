@@ -64,6 +64,11 @@ class Machine:
             point = pivot + rotate(angle, point + shift - pivot)
         return point
 
+    def turned(self, axes_mm: F) -> F:
+        """Return the rotation of the tool against the workpiece at axis positions (n, 3), to first order the carriages' sum, (n, 3) rad."""
+        total: F = np.sum([self.motions(axis, axes_mm[:, axis])[1] for axis in range(3)], axis=0)
+        return total
+
 
 def rotate(angle_rad: F, vector: F) -> F:
     """Rotate n vectors by n rotation vectors (right-handed, Rodrigues): both (n, 3)."""

@@ -48,7 +48,7 @@ def known_machine(chain: str, rng: np.random.Generator) -> tuple[TrueMachine, di
     square = 50e-6 * rng.standard_normal(3)
     names.update(zip(("C0Y", "B0Z", "A0Z"), square, strict=True))
     play = tuple(Play(lambda x, b=b: np.full_like(x, b), np.zeros(3)) for b in LOST_UM)
-    return TrueMachine(chain, STROKE_MM, PIVOTS_MM, curves, square, play, mirror_turns=False), names
+    return TrueMachine(chain, STROKE_MM, PIVOTS_MM, curves, square, play), names
 
 
 def as_the_solver_has_it(step: Step) -> RunData:
@@ -88,7 +88,8 @@ def test_readings_of_a_known_machine_are_those_that_the_solver_predicts(chain: s
     machine = Machine(chain, STROKE_MM, PIVOTS_MM)
     for run, reading in zip(runs, made, strict=True):
         assert reading.std() > 2e-3
-        np.testing.assert_allclose(reading, predict(machine, terms, run, unknowns, theta), rtol=0, atol=1e-9)
+        close = 1e-9 if run.beam is None else 1e-4  # the solver's mirror turns by the sum of three rotations of up to a milliradian
+        np.testing.assert_allclose(reading, predict(machine, terms, run, unknowns, theta), rtol=0, atol=close)
 
 
 @pytest.mark.parametrize("family", [f for f in FAMILIES if f != "measured"])

@@ -168,6 +168,8 @@ def additions(machine: Machine, runs: tuple[RunData, ...], known: Knowledge, nam
     """
     there = present(runs)
     lasers = (*_lines(machine, there, order), _edges(machine, there, order), _diagonals(machine, there, order))
+    if not all(r.mirror_turns for r in runs if r.kind == "laser"):  # another laser run would have the same mirror
+        lasers = tuple(replace(a, runs=tuple(replace(r, mirror_turns=False) for r in a.runs)) for a in lasers)
     return (*_certificates(known, names), *lasers, *_bar_additions(machine, runs, there))
 
 

@@ -67,7 +67,7 @@ def as_meant(run: RunData) -> RunData:
     middle, along = line
     straight = middle + np.outer((run.axes_mm - middle) @ along, along)
     near = float(np.linalg.norm(np.cross(along, run.beam))) <= NEAR_BEAM
-    return replace(run, axes_mm=straight, beam=along * np.sign(along @ run.beam) if near else run.beam)
+    return replace(run, axes_mm=straight, start_mm=None, beam=along * np.sign(along @ run.beam) if near else run.beam)
 
 
 def _on_the_sphere(run: RunData) -> F2:

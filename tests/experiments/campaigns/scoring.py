@@ -136,7 +136,7 @@ def unseen_entries(case: Case, solution: JointSolution, seen: Traces) -> list[st
     basis = seen.hidden_basis(0.1)
     bent = Bent(case.truth.rig.machine(), points)
     smooth = [n for n in seen.names if not n.startswith("backlash")]
-    moved = np.stack([(bent.moved_mm(n, typical_size(case, n)) - bent.straight_mm).ravel() for n in smooth], axis=1) @ basis[: len(smooth)]
+    moved = np.stack([(bent.moved(n, typical_size(case, n))[0] - bent.straight[0]).ravel() for n in smooth], axis=1) @ basis[: len(smooth)]
     free = np.stack([remove_rigid(points, m.reshape(-1, 3)) for m in moved.T], axis=2) if basis.shape[1] else np.zeros((len(points), 3, 1))
     unseen = np.sqrt((free**2).sum(axis=(1, 2)))
     stated = np.linalg.norm(table.u_mm.reshape(-1, 3), axis=1)

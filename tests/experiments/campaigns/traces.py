@@ -10,7 +10,7 @@ import numpy as np
 from numpy.polynomial import legendre
 
 from abbe.models.solvers.observations import RunData
-from abbe.simulators.truth.machine import Machine
+from abbe.simulators.truth.machine import Machine, rotate
 from tests.experiments.campaigns.population import UNCALIBRATED_SD_MM, Case
 
 COMPONENTS = "XYZABC"
@@ -29,12 +29,12 @@ class Bent(Machine):
         self.axes_mm = axes_mm
         self._straight = [machine.motions(axis, axes_mm[:, axis]) for axis in range(3)]
         self._name, self._size = "", 0.0
-        self.straight_mm = self.tool_position(axes_mm)
+        self.straight = self.tool_position(axes_mm), self.turned(axes_mm)
 
-    def moved_mm(self, name: str, size: float) -> np.ndarray:
-        """Where the tool stands with that error, (n, 3) mm."""
+    def moved(self, name: str, size: float) -> tuple[np.ndarray, np.ndarray]:
+        """Where the tool stands with that error, (n, 3) mm, and how it is turned, (n, 3) rad."""
         self._name, self._size = name, size
-        return self.tool_position(self.axes_mm)
+        return self.tool_position(self.axes_mm), self.turned(self.axes_mm)
 
     def motions(self, axis: int, position_mm: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         shift, angle = (v.copy() for v in self._straight[axis])
@@ -129,15 +129,19 @@ def _changes(case: Case, run: RunData, names: tuple[str, ...], sizes: np.ndarray
     bent = Bent(machine, stands)
     cup = machine.tool_position(run.centre_mm[None])[0] if run.kind == "bar" else None
 
-    def reading(where: np.ndarray) -> np.ndarray:
-        return np.linalg.norm(where - cup, axis=1) if cup is not None else (where - where[0]) @ run.beam
+    def reading(where: np.ndarray, turned: np.ndarray) -> np.ndarray:
+        if cup is not None:
+            return np.linalg.norm(where - cup, axis=1)
+        mirror = rotate(turned, np.tile(run.beam, (len(where), 1)))
+        return np.einsum("ij,ij->i", where - where[0], mirror) / (mirror @ run.beam)
 
-    base, out = reading(bent.straight_mm), []
+    base, out = reading(*bent.straight), []
     for name, size in zip(names, sizes, strict=True):
         if name.startswith("backlash"):
-            out.append(reading(machine.tool_position(stands - 0.5 * size * run.sign * np.eye(3)["XYZ".index(name[-1])])))
+            at = stands - 0.5 * size * run.sign * np.eye(3)["XYZ".index(name[-1])]
+            out.append(reading(machine.tool_position(at), machine.turned(at)))
         else:
-            out.append(reading(bent.moved_mm(name, float(size))))
+            out.append(reading(*bent.moved(name, float(size))))
     return np.stack(out, axis=1) - base[:, None]
 
 

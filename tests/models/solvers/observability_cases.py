@@ -65,7 +65,8 @@ def laser(label: str, path: np.ndarray, beam: np.ndarray | None = None) -> RunDa
     n = len(path)
     way = path[int(np.argmax(np.linalg.norm(path - path[0], axis=1)))] - path[0]
     beam = way / np.linalg.norm(way) if beam is None else beam
-    return RunData(label, label, "laser", path, np.zeros(n), travel_sign(path), np.arange(n) * 1.0, np.ones(n), beam=beam)
+    t_s = np.arange(n) * 1.0  # the papers' mirror keeps its direction
+    return RunData(label, label, "laser", path, np.zeros(n), travel_sign(path), t_s, np.ones(n), beam=beam, mirror_turns=False)
 
 
 def helix(label: str, origin: np.ndarray, radius: float, **stated) -> RunData:

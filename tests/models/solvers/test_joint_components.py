@@ -12,7 +12,7 @@ from tests.models.solvers.truth import MACHINE
 
 FREE = np.full(2, np.inf)
 SIZES = SizeModel(
-    np.ones(6), np.eye(6), (), (), 0.5, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), sd=np.array([2.0, 2.0]), low=-FREE, high=FREE
+    np.ones(6), np.eye(6), (), (), 0.5, 0.1, ("a", "b"), np.repeat(np.eye(2), 3, axis=0), sd=np.array([2.0, 2.0]), low=-FREE, high=FREE
 )
 
 
@@ -64,7 +64,8 @@ def test_noise_and_sizes_come_back_without_bias():
 def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nanometres():
     model = size_model(MACHINE, smooth_terms(6), (), np.ones(0), Priors())
     n, h = model.typical.size, model.sd.size
-    small = Components(np.array([-14.0 * (name == "angle") for name in model.names]), np.zeros(2))
+    size = {"angle": -14.0, "positioning": -1.0, "straightness": -1.0}  # below the documented size, from where ignorance may widen
+    small = Components(np.array([size.get(name, 0.0) for name in model.names]), np.zeros(2))
     found = [cautious(model, FittedComponents(small, v * np.eye(h + 2), 0.0)) for v in (1e-12, 0.5)]
     before, known, unknown = (np.linalg.norm(m.root * c.half(m), axis=1) for m, c in ((model, small), *found))
     at = np.concatenate(model.blocks)

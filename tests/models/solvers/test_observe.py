@@ -18,7 +18,7 @@ from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import linearise, perpendicular, predict, run_design, run_jacobian, setup_unknowns
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.simulators.scenario import MachineConfig
-from abbe.simulators.truth.machine import Geometry, Play
+from abbe.simulators.truth.machine import Geometry, Play, rotate
 from abbe.simulators.truth.machine import Machine as TrueMachine
 
 STROKE = np.array([[0.0, 600.0], [-50.0, 450.0], [20.0, 470.0]])
@@ -199,7 +199,9 @@ def test_the_independent_simulator_reads_the_same(chain, lost_motion):
             e1, e2 = perpendicular(run.beam)
             t1, t2 = (by_name.get(f"tilt_{run.setup}_{k}", 0.0) for k in "12")
             mirror = run.beam + t1 * e1 + t2 * e2
-            seen = (at - at[0]) @ mirror * (1 + by_name[f"cosine_{run.setup}"]) * (1 + by_name["laser_scale"])
+            turned = rotate(truth.turned(stands), np.tile(mirror, (len(at), 1)))
+            factor = (1 + by_name[f"cosine_{run.setup}"]) * (1 + by_name["laser_scale"])
+            seen = np.einsum("ij,ij->i", at - at[0], turned) / (turned @ run.beam) * factor
             want = seen - (run.axes_mm - run.axes_mm[0]) @ run.beam
             want += by_name[f"zero_{run.label}"] + by_name[f"drift_{run.label}"] * (run.t_s - run.t_s[0])
         assert values[clear] == pytest.approx(want[clear], abs=2e-5 if lost_motion else 1e-11)

@@ -235,11 +235,8 @@ class Wang:
         out = []
         for k, ((label, p, beam), part) in enumerate(zip(paths, parts, strict=True)):
             n = len(p)
-            out.append(
-                RunData(
-                    label, label, "laser", p, np.append(0.0, part), np.zeros((n, 3)), 600.0 * k + 2.0 * np.arange(n), np.ones(n), beam=beam
-                )
-            )
+            read, t_s = np.append(0.0, part), 600.0 * k + 2.0 * np.arange(n)
+            out.append(RunData(label, label, "laser", p, read, np.zeros((n, 3)), t_s, np.ones(n), beam=beam, mirror_turns=False))
         return tuple(out)
 
     def solved_um(self, runs: tuple[RunData, ...], sigma_mm: float, priors: Priors) -> float:

@@ -71,7 +71,13 @@ def test_words_on_the_screen_say_the_same(solved, capsys):
     assert 5 <= len(summary_lines(told, solution)) <= 10
     print_solution(told, solution, details=True)
     text = " ".join(capsys.readouterr().out.split())
-    for words in ("on the sphere of their run only", "mirror tilt", "temperature", "step diagonals XYZ", "one tool length"):
+    for words in (
+        "on the sphere of their run only",
+        "mirror tilt",
+        "temperature",
+        "step diagonals XYZ",
+        "Step diagonals in another step order",
+    ):
         assert words in text
     assert "1 combinations" not in text
     assert any("temperature" in row.note for row in parameter_rows(solved.joint))

@@ -62,9 +62,9 @@ class Truth:
         beam = (p[len(p) // 2] - p[0]) / np.linalg.norm(p[len(p) // 2] - p[0])
         tilt = self.rng.normal(0, 150e-6, 2) @ perpendicular(beam)
         sign = travel_sign(p)
-        moved = p + self.deviation(p, sign)
-        m = beam + tilt
-        reading = (moved - moved[0]) @ m / (m @ beam) - (p - p[0]) @ beam + self.rng.normal(0, 2.4e-4, len(p))
+        moved, turned = p + self.deviation(p, sign), self.motions(p)[:, :, 3:].sum(axis=1)
+        m = beam + tilt + np.cross(turned, beam + tilt)  # the mirror is on the spindle
+        reading = ((moved - moved[0]) * m).sum(axis=1) / (m @ beam) - (p - p[0]) @ beam + self.rng.normal(0, 2.4e-4, len(p))
         return RunData(label, label, "laser", p, reading, sign, np.arange(len(p)) * 1.0, np.ones(len(p)), beam=beam)
 
     def helices(self, tool_mm: np.ndarray | None = None, length_mm: float = 1.5e-3) -> list[RunData]:

@@ -34,8 +34,10 @@ FXYZ = Machine("w-b-X-Y-Z-t", np.array([[0.0, 800.0], [0.0, 500.0], [0.0, 400.0]
 
 
 def laser(label: str, p: np.ndarray) -> RunData:
+    """A run whose mirror keeps its direction, as in the paper."""
     n, beam = len(p), (p[-1] - p[0]) / np.linalg.norm(p[-1] - p[0])
-    return RunData(label, label, "laser", p, np.zeros(n), travel_sign(p), np.arange(n) * 1.0, np.ones(n), beam=beam)
+    t_s = np.arange(n) * 1.0
+    return RunData(label, label, "laser", p, np.zeros(n), travel_sign(p), t_s, np.ones(n), beam=beam, mirror_turns=False)
 
 
 def diagonals(orders: tuple[str, ...]) -> list[RunData]:
