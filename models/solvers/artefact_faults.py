@@ -23,11 +23,15 @@ NOISY, STRONG = 4.0, 25.0
 """Poses are doubted if points scatter by this factor more than they repeat; least gain of log evidence to say so."""
 STEP_MM, STEP_RAD = 0.02, 1e-4
 """Prior size of a motion of the artefact during a run."""
+QUIETER = 1.5
+"""Least factor by which points scatter less if a run is parted."""
 DOUBTED = 0.5
 """A point of less weight is doubted."""
 STEPS = np.array([STEP_MM] * 3 + [STEP_RAD] * 3)
 FALSE_TRIGGER_MM, FALSE_TRIGGERS = 0.01, 3
 """A point off by more is a false trigger; more points of a run than these are none."""
+MOST = 0.3
+"""Least share of a form that its swirl makes."""
 RADIUS_MM, TWIST_MM, SIGMA = 8e-3, 6e-3, 4.0
 """Least wrong radius and twist that are named, and by how many standard uncertainties they must differ from zero."""
 
@@ -57,9 +61,11 @@ def undone(runs: tuple[RunData, ...], settle: Settle) -> tuple[tuple[RunData, ..
         stepped = _step(problem, fit)
         if stepped is None:
             break
-        runs, label = stepped
-        problem, fit = settle(runs)
-        runs, problem, fit = _moved_step(runs, problem, fit, label, settle)
+        parted, label = stepped
+        parted, new_problem, new = _moved_step(parted, *settle(parted), label, settle)
+        if _noise(fit) < QUIETER * _noise(new):  # rough motions of the machine look like steps, too
+            break
+        runs, problem, fit = parted, new_problem, new
         found.append(_motion(problem, fit, label))
     return runs, found
 
@@ -244,17 +250,32 @@ def _twist(joint: JointSolution) -> list[ArtefactFault]:
         poses = [p for _, p in mine if p.artefact == name]
         places = {f: n for p in poses for f, n in zip(p.feature, p.nominal_mm, strict=True)}
         amount = swirl_functional(poses[0], places, e.names)
-        if amount is None:
+        if amount is None or len(poses) < 2:  # one pose cannot tell the part from the machine (`plate_fit`)
             continue
         value, u = float(amount @ e.theta), float(np.sqrt(amount @ e.covariance @ amount))
-        form = np.array([n.startswith("form_") for n in e.names])
-        if abs(value) > max(TWIST_MM, SIGMA * u, 3.0 * float(np.linalg.norm((amount * joint.prior_sd)[form]))):
+        form = np.array([n.startswith(f"form_{name}_") for n in e.names])
+        usual = float(np.linalg.norm((amount * joint.prior_sd)[form]))
+        if abs(value) > max(TWIST_MM, SIGMA * u, 3.0 * usual) and _share(poses[0], places, e.theta, e.names, value) > MOST:
             what = (
                 f"a rotation growing with r² of {1e3 * value:+.1f} ± {2e3 * u:.1f} µm at the rim goes with the part in {len(poses)} poses: "
                 "form of the plate (a twist), as far as these poses say, not a motion of the machine"
             )
             out.append(ArtefactFault(mine[0][0].label, what, "left out of the machine"))
     return out
+
+
+def _share(p: ArtefactPoints, places: dict[str, F1], theta: F1, names: tuple[str, ...], value: float) -> float:
+    """Share of the form's sum of squares that its swirl makes; 1 for a workpiece, whose form is smooth."""
+    at = {n: i for i, n in enumerate(names)}
+    rows = [[at.get(f"form_{p.artefact}_{f}_{k}") for k in "xy"] for f in places]
+    if any(row is None for pair in rows for row in pair):
+        return 1.0
+    q = (np.array(list(places.values())) - p.middle_mm)[:, :2] / p.reach_mm
+    affine = np.column_stack([np.ones(len(q)), q])
+    swirl = np.stack([-q[:, 1], q[:, 0]], axis=1) * (q**2).sum(axis=1, keepdims=True)
+    form = theta[np.array(rows, dtype=np.int64)] + swirl * (theta[at[f"twist_{p.artefact}_0"]] if f"twist_{p.artefact}_0" in at else 0.0)
+    free, left = (v - affine @ np.linalg.lstsq(affine, v, rcond=None)[0] for v in (swirl, form))
+    return float(value**2 * (free**2).sum() / max(float((left**2).sum()), 1e-18))
 
 
 def swirl_functional(p: ArtefactPoints, places: dict[str, F1], names: tuple[str, ...]) -> F1 | None:

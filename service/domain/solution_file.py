@@ -264,6 +264,9 @@ class SolutionFile(FileObject):
     motions: dict[str, MotionValue]
     rank: Rank
     rough: list[str] = Field(default_factory=list, description="which motions are rough, with length or period and remedy")
+    artefacts: list[str] = Field(
+        default_factory=list, description="what the poses of an artefact hide and which would tell it; plain fit of each workpiece"
+    )
     not_observable: list[str]
     advice: list[str]
     observability: ObservabilityNumber

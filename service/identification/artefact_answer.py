@@ -9,6 +9,8 @@ from abbe.models.geometry.chain import design
 from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import Fine
 from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability.poses import pose_rank
+from abbe.models.solvers.plate_fit import plate_fit
 
 SENSED = 1e-3
 """An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
@@ -21,6 +23,13 @@ NOT_SENSED = "; the third direction was not sensed"
 def only_artefacts(joint: JointSolution) -> bool:
     """Whether all readings of a solution are points of artefacts."""
     return all(run.kind == "artefact" for run in joint.data)
+
+
+def artefact_lines(joint: JointSolution) -> list[str]:
+    """Return what the poses of an artefact hide and which pose would tell it, and the plain fit of every workpiece alone."""
+    rank = pose_rank(joint.data)
+    fits = [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
+    return ([rank.text] if rank is not None else []) + fits
 
 
 def without_length(joint: JointSolution) -> bool:

@@ -48,6 +48,7 @@ from abbe.service.domain.solution_file import (
     Versions,
     WorstPoint,
 )
+from abbe.service.identification.artefact_answer import artefact_lines
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.stored_prediction import prediction_of
 from abbe.service.identification.unknown_table import with_unknown_table
@@ -202,6 +203,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
         rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),
         rough=list(rough_lines(joint)),
+        artefacts=artefact_lines(joint),
         not_observable=not_observable(found),
         advice=[a.text for a in o.advice],
         observability=ObservabilityNumber(

@@ -158,7 +158,7 @@ def _solution(result: SolutionResult | None) -> Evaluated:
     return Evaluated(
         figures=figures,
         pictures=[Picture(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
-        remarks=[*solution.flags, *solution.rough],
+        remarks=[*solution.flags, *solution.rough, *solution.artefacts],
         not_observable=[*solution.not_observable],
         statements=[statement],
     )

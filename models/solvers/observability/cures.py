@@ -307,9 +307,10 @@ def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
 def _with(runs: tuple[RunData, ...], tool_mm: F1, key: str) -> tuple[RunData, ...]:
     """The ball-bar runs (the laser runs if there are none) repeated with another tool and new set-ups."""
     out = []
-    for run in (tuple(r for r in runs if r.kind == "bar") or runs)[:RUNS]:
+    others = tuple(r for r in runs if r.points is None or r.points.source != "length")
+    for run in (tuple(r for r in runs if r.kind == "bar") or others)[:RUNS]:
         n = run.deviation_mm.size
-        at = np.unique(np.linspace(0, n - 1, min(n, READINGS)).round().astype(np.intp))
+        at = np.unique(np.linspace(0, n - 1, n if run.points else min(n, READINGS)).round().astype(np.intp))
         parts = {name: getattr(run, name)[at] for name in ("axes_mm", "deviation_mm", "sign", "t_s", "weight_n")}
         out.append(replace(run, label=f"{key} {run.label}", setup=f"{key} {run.setup}", tool_mm=tool_mm, **parts))
     return tuple(out)

@@ -62,12 +62,17 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     """Import a campaign folder, or files of instruments as one campaign after a preview: all of it or, after any mistake, nothing.
 
     Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
-    about their columns; the answers are kept as FILE.columns.toml. What files do not say is asked, or stays unknown and widens U.
+    about their columns; the answers are kept as FILE.columns.toml. Lists of an artefact's points, one file for each pose,
+    need no questions (docs/how-to/artefact.md). What files do not say is asked, or stays unknown and widens U.
     Temperatures of the options count for files that state none. -m FILE: the machine with its chain and strokes, and its
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
     from abbe.service.instrument_files.answers import Answers
+    from abbe.service.instrument_files.point_list import is_point_list
 
+    if all(is_point_list(path) for path in files):
+        _import_points(files, name or files[0].stem, (db, machine), as_json=as_json)
+        return
     if len(files) == 1 and (files[0].is_dir() or not files[0].suffix):
         _import_folder(files[0], db, machine, as_json=as_json)
         return
@@ -75,6 +80,22 @@ def import_files(  # noqa: PLR0913 - one argument for each option
         axis=axis, unit=unit, sign=sign, at_mm=at_mm, scale_c=scale_c, air_c=air_c, pressure_hpa=pressure_hpa, feed_mm_min=feed_mm_min
     )
     _import_files(files, columns, answers, name or files[0].stem, (db, machine), yes=yes, as_json=as_json)
+
+
+def _import_points(files: list[Path], name: str, where: tuple[str | None, Path | None], *, as_json: bool) -> None:
+    """Store lists of an artefact's points as one campaign; they leave nothing to ask."""
+    from abbe.service.config import load_machine
+    from abbe.service.instrument_files.point_list import campaign_of_points
+    from abbe.service.runs.exchange import store_folder
+    from abbe.service.site import site_of
+
+    db, machine = where
+    file = machine if db is not None else named_machine(machine)
+    folder = campaign_of_points(files, name, None if file is None else site_of(load_machine(file).machine).doc)
+    with open_store(database_url(db, machine), must_exist=False) as store:
+        record = store.campaigns.find(store_folder(store, folder))
+        _said(record.name, len(folder.runs), store.url, as_json=as_json)
+    conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
 
 
 def _import_folder(folder: Path, db: str | None, machine: Path | None, *, as_json: bool) -> None:

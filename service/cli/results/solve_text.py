@@ -41,7 +41,12 @@ def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
         f"of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well"
     )
     lines += [worst_line(summary), f"largest errors (U, k = 2): {_largest(summary)}", f"holds at: {solution.holds_at}"]
-    against = {"look at these runs": solution.flags, "rough": solution.rough, "these runs cannot tell": solution.not_observable}
+    against = {
+        "look at these runs": solution.flags,
+        "rough": solution.rough,
+        "artefacts": solution.artefacts,
+        "these runs cannot tell": solution.not_observable,
+    }
     lines += [f"{word}: {_first(found)}" for word, found in against.items() if found]
     if solution.table_removal is not None:
         lines.append(table_line(solution.table_removal))
@@ -81,6 +86,8 @@ def _details(summary: Assessment, solution: SolutionFile) -> None:
     _lines("residuals that are not noise:", residual_lines(summary.joint))
     if solution.rough:
         _lines("rough:", solution.rough)
+    if solution.artefacts:
+        _lines("artefacts:", solution.artefacts)
     _lines("these runs cannot tell:", solution.not_observable)
     _lines("what would show more:", solution.advice)
 
