@@ -23,8 +23,8 @@ NOISY, STRONG = 4.0, 25.0
 """Poses are doubted if points scatter by this factor more than they repeat; least gain of log evidence to say so."""
 STEP_MM, STEP_RAD = 0.02, 1e-4
 """Prior size of a motion of the artefact during a run."""
-QUIETER = 1.5
-"""Least factor by which points scatter less if a run is parted."""
+QUIETER, GROSS_SIGMA = 1.5, 50.0
+"""Least factor by which the points of a run scatter less if it is parted, and what a gross one counts at most."""
 DOUBTED = 0.5
 """A point of less weight is doubted."""
 STEPS = np.array([STEP_MM] * 3 + [STEP_RAD] * 3)
@@ -63,7 +63,7 @@ def undone(runs: tuple[RunData, ...], settle: Settle) -> tuple[tuple[RunData, ..
             break
         parted, label = stepped
         parted, new_problem, new = _moved_step(parted, *settle(parted), label, settle)
-        if _noise(fit) < QUIETER * _noise(new):  # rough motions of the machine look like steps, too
+        if _scatter(problem, fit, label) < QUIETER * _scatter(new_problem, new, label):  # rough motions of the machine look like steps, too
             break
         runs, problem, fit = parted, new_problem, new
         found.append(_motion(problem, fit, label))
@@ -106,6 +106,13 @@ def _points(run: RunData) -> list[np.ndarray[tuple[int], np.dtype[np.intp]]]:
 def _noise(fit: CampaignFit) -> float:
     """Scatter of points as a multiple of their stated repeatability."""
     return float(np.exp(0.5 * fit.components.eta[KINDS.index("artefact")]))
+
+
+def _scatter(problem: CampaignProblem, fit: CampaignFit, label: str) -> float:
+    """Rms residual of a run in units of its stated noise, with what was left out; gross points count little."""
+    i = next(k for k, r in enumerate(problem.runs) if r.label == label)
+    size = problem.split(np.abs(fit.residual_mm) / problem.sigma)[i]
+    return float(np.sqrt(np.mean(np.minimum(size, GROSS_SIGMA) ** 2)))
 
 
 def _quarter_turn(
