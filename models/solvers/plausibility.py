@@ -289,11 +289,16 @@ def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1
 def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
     as_is = together([r.as_is for r in runs]).log_evidence
     found = [_judged(run, [r.as_is for r in runs if r is not run], as_is) for run in runs]
-    found = [s for s in found if s.gain > limit and (s.cause != "other" or s.misfit_mm > max(GROSS * s.expected_mm, GROSS_MM))]
+    found = [s for s in found if s.gain > limit and s.misfit_mm > _least_misfit_mm(s)]
     if not found:
         return None
     worst = max(found, key=lambda s: s.gain)
     return replace(worst, tied=tuple(s.run for s in found if s.run != worst.run and worst.gain - s.gain < limit))
+
+
+def _least_misfit_mm(s: SuspectRun) -> float:
+    """A run that is as far from the others as expected is only noisy, whatever factor makes it quieter."""
+    return max(GROSS * s.expected_mm, GROSS_MM) if s.cause == "other" else s.expected_mm
 
 
 def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
