@@ -15,6 +15,8 @@ from abbe.models.solvers.plate_fit import plate_fit
 SENSED = 1e-3
 """An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
 COVERAGE = 2.0
+WHOLE_TO, NOTHING_FROM = 0.35, 1.0
+"""Mean squared uncertainty over mean squared deviation up to which a map is offered whole, and from which not at all."""
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
 NO_LENGTH = "; no length is calibrated: the scale is not observable"
 NOT_SENSED = "; the third direction was not sensed"
@@ -62,10 +64,21 @@ def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2,
     covariance = joint.estimate.covariance[np.ix_(chosen, chosen)]
     u: F1 = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, covariance, rows), 0.0))
     deviation, expanded = np.full((2, len(points_mm), 3), np.nan)
-    deviation[:, keep] = (rows @ joint.estimate.theta[chosen]).reshape(-1, len(keep))
-    expanded[:, keep] = COVERAGE * np.hypot(u.reshape(-1, len(keep)), scatter_mm[keep])
+    value, spread = (rows @ joint.estimate.theta[chosen]).reshape(-1, len(keep)), np.hypot(u.reshape(-1, len(keep)), scatter_mm[keep])
+    share = _offered(value, spread)
+    deviation[:, keep], expanded[:, keep] = share * value, COVERAGE * np.hypot(spread, (1.0 - share) * value)
     plane, scale = (" in the plane", NOT_SENSED) if axis is not None else ("", ""), (" and common scale", NO_LENGTH) if free else ("", "")
     return deviation, expanded, MOTION.format(plane=plane[0], scale=scale[0]) + scale[1] + plane[1]
+
+
+def _offered(value_mm: F2, u_mm: F2) -> float:
+    """Return the share of a map that is offered: all of it if it is clearly larger than its uncertainty, nothing if it is smaller.
+
+    A map that the readings hardly show is often worse than none.
+    """
+    size = float(np.mean(value_mm**2))
+    doubt = float(np.mean(u_mm**2)) / size if size > 0.0 else 1.0
+    return float(np.clip((NOTHING_FROM - doubt) / (NOTHING_FROM - WHOLE_TO), 0.0, 1.0))
 
 
 def _fine(joint: JointSolution) -> tuple[tuple[Fine, ...], F1]:
