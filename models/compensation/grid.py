@@ -20,6 +20,7 @@ from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation, unobserved_mm
+from abbe.models.uncertainty.scales import Scales, scale_projection, without_scales
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 FIT_SAMPLES = 5
@@ -247,17 +248,25 @@ def grid_table(
 
 
 def compensable_nodes(
-    solution: JointSolution, counts: tuple[int, int, int], *, inputs: StatedInputs | None = None, k: float | None = None
+    solution: JointSolution,
+    counts: tuple[int, int, int],
+    *,
+    inputs: StatedInputs | None = None,
+    k: float | None = None,
+    scales: Scales | None = None,
 ) -> Mask:
     """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
     The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes where the part that no
-    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`).
+    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`). ``scales``: left out of both.
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
-    prediction = predict_deviation(error_sources(solution, inputs), points, frame=frame)
-    observed = unobserved_mm(solution, points, frame) <= np.linalg.norm(prediction.deviation_mm, axis=1)
+    sources, projection = error_sources(solution, inputs), None
+    if scales is not None:
+        sources, projection = without_scales(sources, scales), scale_projection(solution.machine, solution.terms, scales)
+    prediction = predict_deviation(sources, points, frame=frame)
+    observed = unobserved_mm(solution, points, frame, projection=projection) <= np.linalg.norm(prediction.deviation_mm, axis=1)
     return np.asarray((compensable_mask(prediction, k=k).points & observed).reshape(counts), dtype=bool)
 
 

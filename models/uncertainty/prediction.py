@@ -253,9 +253,15 @@ def unobserved_directions(solution: JointSolution) -> F2:
     return np.asarray(typical[:, None] * vectors[:, values < NO_TRACE_SIGMA**2])
 
 
-def unobserved_mm(solution: JointSolution, points_mm: F2, frame: RigidFree, tool_mm: F1 | None = None) -> F1:
-    """Return the rms length of the deviation that no reading shows, if errors have typical sizes, at points (m, 3), mm, shape (m,)."""
+def unobserved_mm(
+    solution: JointSolution, points_mm: F2, frame: RigidFree, tool_mm: F1 | None = None, *, projection: F2 | None = None
+) -> F1:
+    """Return the rms length of the deviation that no reading shows, if errors have typical sizes, at points (m, 3), mm, shape (m,).
+
+    ``projection``: of the coefficients, shape (terms, terms), if only a part of the map is used (`abbe.models.uncertainty.scales`).
+    """
     hidden = unobserved_directions(solution)
+    hidden = hidden if projection is None else projection @ hidden
     if not hidden.shape[1]:
         return np.zeros(len(points_mm))
     moved = unit_deviation(solution.machine, solution.terms, points_mm, tool_mm, frame) @ hidden

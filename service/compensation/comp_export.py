@@ -21,6 +21,7 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES, Machine
+from abbe.models.uncertainty.scales import SCALE_TEXTS, Scales, scale_projection
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.errors import FileFormatError, FormatRefused, SignatureRefused, TableFileError
@@ -50,13 +51,23 @@ class Exported:
     notes: tuple[str, ...]
 
 
-def identified(doc: dict[str, Any]) -> Identified:
+def scales_badly_known(doc: dict[str, Any]) -> Scales | None:
+    """The scales that are the largest part of a stored solution's uncertainty; None if none are."""
+    found = ((doc.get("uncertainty") or {}).get("without_scale") or {}).get("scales")
+    return found if found in SCALE_TEXTS else None
+
+
+def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identified:
     """The machine of a stored solution (``abbe-solution/1``): geometry, coefficients, lost motion where it was observed.
+
+    ``without_scale``: without the scales that are the largest part of its uncertainty.
 
     Raises
     ------
     FileFormatError
         The document holds no coefficients, or no machine.
+    FormatRefused
+        The scales are not what the solution knows worst.
     """
     for key, what in (("prediction", "coefficients"), ("machine", "machine")):
         if not isinstance(doc.get(key), dict):
@@ -69,7 +80,25 @@ def identified(doc: dict[str, Any]) -> Identified:
         observed = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}
     except (ValueError, KeyError, TypeError) as error:
         raise FileFormatError(f"the solution cannot be read: {error}", "solve the campaign again: abbe solve") from None
+    if without_scale:
+        scales = scales_badly_known(doc)
+        if scales is None:
+            raise FormatRefused("this solution knows the scales no worse than the rest", "export it without --without-scale")
+        coefficients = scale_projection(machine, terms, scales) @ coefficients
     return Identified(machine, terms, coefficients, observed)
+
+
+def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
+    """Say what becomes of badly known scales in the tables; no line if the solution knows them."""
+    scales = scales_badly_known(doc)
+    if scales is None:
+        return []
+    u = doc["uncertainty"]
+    text, worst = SCALE_TEXTS[scales], u["worst_point"]["expanded_vector_um"]
+    rest = f"the rest is known to ± {u['without_scale']['expanded_vector_um']:.2g} µm at the worst"
+    if without_scale:
+        return [f"{text}: left out, and not corrected; {rest}"]
+    return [f"{text}: written, but these runs hardly tell: ± {worst:.2g} µm with it, {rest}: --without-scale leaves it out"]
 
 
 def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:

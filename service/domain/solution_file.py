@@ -155,14 +155,31 @@ class BudgetLineValue(FileObject):
     dof: float | None = None
 
 
+class WithoutScale(FileObject):
+    """The map without the scales that are the largest part of its uncertainty: the common one, or that of each axis.
+
+    ``error_um``: rms of the deviation; ``rms_um``: of its standard uncertainty; ``expanded_vector_um``: 95 % at the worst point.
+    """
+
+    scales: Literal["common", "axes"]
+    error_um: float
+    rms_um: float
+    expanded_vector_um: float
+    compensable_share: float
+
+
 class Uncertainty(FileObject):
-    """Uncertainty of the predicted deviation over the volume. ``compensable_share``: share of the volume where the error exceeds it."""
+    """Uncertainty of the predicted deviation over the volume. ``compensable_share``: share of the volume where the error exceeds it.
+
+    ``without_scale``: what is known without the scales, if they are the largest part of the uncertainty.
+    """
 
     frame: str
     worst_point: WorstPoint
     rms_um: float
     budget: list[BudgetLineValue]
     compensable_share: float
+    without_scale: WithoutScale | None = None
 
 
 class VerdictValue(FileObject):

@@ -12,7 +12,7 @@ from abbe.models.compensation.additive import SCALE_NOTE, MeanParameter, mean_li
 from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability.volume import GOOD, USABLE, Number
+from abbe.models.solvers.observability.volume import GOOD, USABLE, Knowing, Number, observability_number, whole_volume
 from abbe.models.solvers.residuals import Outlier
 from abbe.models.solvers.roughness import rough_lines
 from abbe.models.uncertainty.prediction import (
@@ -25,6 +25,7 @@ from abbe.models.uncertainty.prediction import (
     predict_deviation,
     worst_point,
 )
+from abbe.models.uncertainty.scales import SCALE_TEXTS, Scales, scale_projection, without_scales
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 from abbe.service.campaign_data.provenance import campaign_digest, machine_digest, versions
 from abbe.service.domain.document import Doc
@@ -46,9 +47,10 @@ from abbe.service.domain.solution_file import (
     Uncertainty,
     VerdictValue,
     Versions,
+    WithoutScale,
     WorstPoint,
 )
-from abbe.service.identification.artefact_answer import artefact_lines
+from abbe.service.identification.artefact_answer import artefact_lines, only_artefacts
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.stored_prediction import prediction_of
 from abbe.service.identification.unknown_table import with_unknown_table
@@ -73,7 +75,7 @@ class Verdict:
         return ("bad", "open", "ok")[VERDICTS.index(self.word)]
 
 
-def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0) -> Verdict:
+def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0, beside: str = "") -> Verdict:
     """Judge what a solution can be used for.
 
     The layout of the campaign limits the verdict. If the model does not fit, the larger uncertainty that was reached limits it further.
@@ -90,8 +92,10 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
         Number of open flags.
     not_noise : int
         Number of runs with residuals that are not noise.
+    beside : str
+        What is known without the scales (`scale_text`).
     """
-    u, error = float(prediction.u_vector_mm.max()), float(np.sqrt(np.mean(np.sum(prediction.deviation_mm**2, axis=1))))
+    u, error = float(prediction.u_vector_mm.max()), _error_rms_mm(prediction)
     reached = number.before_mm / u if u > 0.0 else np.inf
     level, reasons = VERDICTS.index(number.verdict), []
     if level < VERDICTS.index("good"):
@@ -110,7 +114,7 @@ def verdict(number: Number, prediction: Prediction, share: float, *, flags: int 
         reasons.append(f"{not_noise} run{'s' if not_noise > 1 else ''} with residuals that are not noise")
     largest = float(prediction.expanded_vector_mm.max())
     text = f"Error of {error * 1e3:.2g} µm rms over the volume, known to ± {largest * 1e3:.2g} µm at the worst (95 %, rigid motion removed)"
-    return Verdict(VERDICTS[level], text + (": " + "; ".join(reasons) if reasons else "") + ".", tuple(reasons))
+    return Verdict(VERDICTS[level], text + beside + (": " + "; ".join(reasons) if reasons else "") + ".", tuple(reasons))
 
 
 def layout_line(number: Number) -> str:
@@ -129,7 +133,11 @@ LISTED = 20
 
 @dataclass(frozen=True)
 class Assessment:
-    """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed."""
+    """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed.
+
+    ``scale_free``: the same without those scales that are the largest part of the uncertainty, for tables of all the rest; None if none
+    are. ``left_out``: the scales that this one is without; ``joint`` then still has them, ``sources`` and what follows from them do not.
+    """
 
     solved: Solved
     observability: Observability
@@ -138,6 +146,8 @@ class Assessment:
     budget: Budget
     mask: CompensableMask
     mean: tuple[MeanParameter, ...]
+    scale_free: Assessment | None = None
+    left_out: Scales | None = None
 
     @property
     def joint(self) -> JointSolution:
@@ -158,8 +168,8 @@ def assess(solved: Solved, *, unknown_table: bool = False) -> Assessment:
         solved = replace(solved, joint=with_unknown_table(solved.joint))
     joint = solved.joint
     sources = error_sources(joint, solved.inputs)
-    prediction = predict_deviation(sources, volume_grid(joint.machine.stroke_mm, NODES), frame=volume_frame(joint.machine))
-    return Assessment(
+    prediction = _over_volume(sources)
+    found = Assessment(
         solved,
         observability_of(joint),
         sources,
@@ -168,6 +178,51 @@ def assess(solved: Solved, *, unknown_table: bool = False) -> Assessment:
         compensable_mask(prediction),
         mean_linear(joint),
     )
+    return found if only_artefacts(joint) else replace(found, scale_free=_scale_free(found))
+
+
+def _over_volume(sources: ErrorSources) -> Prediction:
+    machine = sources.solution.machine
+    return predict_deviation(sources, volume_grid(machine.stroke_mm, NODES), frame=volume_frame(machine))
+
+
+LARGEST_PART = 0.5
+"""Share of the variance over the volume above which scales are its largest part."""
+
+
+def _scale_free(found: Assessment) -> Assessment | None:
+    """Return the assessment without the common scale if that is the largest part of the uncertainty, else without the axes' if they are."""
+    for scales in SCALE_TEXTS:
+        sources = without_scales(found.sources, scales)
+        prediction = _over_volume(sources)
+        if np.sum(prediction.u_mm**2) < (1.0 - LARGEST_PART) * np.sum(found.prediction.u_mm**2):
+            o, mask = found.observability, compensable_mask(prediction)
+            turn = scale_projection(o.machine, o.model, scales)
+            knowing = Knowing(*(turn @ c @ turn.T for c in (o.knowing.prior, o.knowing.posterior, o.knowing.noise)))
+            number = observability_number(whole_volume(o.machine, o.model, knowing))
+            return replace(
+                found,
+                observability=replace(o, number=number),
+                sources=sources,
+                prediction=prediction,
+                budget=budget_over(prediction),
+                mask=mask,
+                left_out=scales,
+            )
+    return None
+
+
+def scale_text(found: Assessment) -> str:
+    """Return what is known without the scales that are the largest part of the uncertainty, as the end of a clause; empty if none are."""
+    free = found.scale_free
+    if free is None or free.left_out is None:
+        return ""
+    error, largest = _error_rms_mm(free.prediction) * 1e3, float(free.prediction.expanded_vector_mm.max()) * 1e3
+    return f"; without {SCALE_TEXTS[free.left_out]}, which these runs hardly tell, {error:.2g} µm rms known to ± {largest:.2g} µm"
+
+
+def _error_rms_mm(prediction: Prediction) -> float:
+    return float(np.sqrt(np.mean(np.sum(prediction.deviation_mm**2, axis=1))))
 
 
 def model_key(joint: JointSolution) -> str:
@@ -243,7 +298,8 @@ def as_doc(solution: SolutionFile) -> Doc:
 def solution_verdict(found: Assessment) -> Verdict:
     """Return the verdict on a solution."""
     flagged = len({t.run for t in found.joint.residual_tests if t.flagged})
-    return verdict(found.observability.number, found.prediction, found.mask.share, flags=len(found.solved.flags), not_noise=flagged)
+    number, flags = found.observability.number, len(found.solved.flags)
+    return verdict(number, found.prediction, found.mask.share, flags=flags, not_noise=flagged, beside=scale_text(found))
 
 
 def _verdict(found: Assessment) -> VerdictValue:
@@ -307,6 +363,20 @@ def _uncertainty(found: Assessment) -> Uncertainty:
         rms_um=float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
         budget=[_budget_line(found, line) for line in found.budget.lines],
         compensable_share=found.mask.share,
+        without_scale=_without_scale(found.scale_free),
+    )
+
+
+def _without_scale(free: Assessment | None) -> WithoutScale | None:
+    if free is None or free.left_out is None:
+        return None
+    p = free.prediction
+    return WithoutScale(
+        scales=free.left_out,
+        error_um=_error_rms_mm(p) * 1e3,
+        rms_um=float(np.sqrt(np.mean(p.u_vector_mm**2))) * 1e3,
+        expanded_vector_um=float(p.expanded_vector_mm.max()) * 1e3,
+        compensable_share=free.mask.share,
     )
 
 

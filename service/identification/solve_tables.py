@@ -13,6 +13,7 @@ from abbe.models.geometry.volume import volume_frame
 from abbe.models.uncertainty.campaign_trials import LIMITS, campaign_trials
 from abbe.models.uncertainty.monte_carlo import VALIDATION_SHARE, adaptive, validate
 from abbe.models.uncertainty.prediction import predict_deviation, worst_point
+from abbe.models.uncertainty.scales import SCALE_TEXTS, without_scales
 from abbe.models.uncertainty.sources import error_sources
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
@@ -28,7 +29,7 @@ SEED, TRIALS = 101, 400_000
 def table_rows(found: Assessment, lsb_mm: float) -> list[TableRow]:
     """Return the errors of distances that each kind of table leaves, µm, with standard uncertainties; tables rounded to ``lsb_mm``."""
     out = []
-    for row in achievable(found.joint, lsb_mm=lsb_mm, sources=found.sources):
+    for row in achievable(found.sources.solution, lsb_mm=lsb_mm, sources=found.sources):
         d = row.distances
         values = {k: getattr(d, k.replace("_um", "_mm")) * 1e3 for k in ("rms_um", "u_rms_um", "q95_um", "u_q95_um", "max_um", "u_max_um")}
         out.append(TableRow(kind=row.kind, entries=row.entries, unknown_um=d.unknown_mm * 1e3, **values))
@@ -50,10 +51,13 @@ def machine_grid(found: Assessment, nodes: int, lsb_mm: float) -> GridTable:
         )
     verdict = solution_verdict(found)
     if verdict.sign == "bad":
-        raise TableRefused(f"no grid from a solution that is {verdict.word}: {verdict.reasons[0]}", "measure more; nothing was written")
+        free = found.scale_free
+        usable = free is not None and solution_verdict(free).sign != "bad"
+        remedy = "leave the scales out (--without-scale), or measure more" if usable else "measure more"
+        raise TableRefused(f"no grid from a solution that is {verdict.word}: {verdict.reasons[0]}", f"{remedy}; nothing was written")
     counts = (nodes, nodes, nodes)
-    mask = compensable_nodes(found.joint, counts, inputs=found.sources.inputs)
-    table = quantise_grid(grid_table(found.joint, counts, compensable=mask, sources=found.sources), lsb_mm)
+    mask = compensable_nodes(found.joint, counts, inputs=found.sources.inputs, scales=found.left_out)
+    table = quantise_grid(grid_table(found.sources.solution, counts, compensable=mask, sources=found.sources), lsb_mm)
     if not table.compensated.any():
         raise TableRefused("the error exceeds its uncertainty nowhere: there is nothing to compensate", "nothing was written")
     return table
@@ -65,6 +69,21 @@ def grid_text(table: GridTable) -> str:
     rows = zip(nodes_mm(table.position_mm), values, table.compensated.reshape(-1), strict=True)
     lines = [",".join([*(f"{v:.10g}" for v in p), *(f"{v:.6g}" for v in d), str(int(c))]) for p, d, c in rows]
     return "\n".join([GRID_HEADER, *lines]) + "\n"
+
+
+def scale_free(found: Assessment) -> Assessment:
+    """Return the assessment of everything but the scales.
+
+    Raises
+    ------
+    TableRefused
+        The scales are not what the runs know worst.
+    """
+    if found.scale_free is None:
+        raise TableRefused(
+            "these runs know the scales no worse than the rest, so there is nothing to leave out", "run again without --without-scale"
+        )
+    return found.scale_free
 
 
 def deviation_text(found: Assessment, points_mm: F2) -> str:
@@ -80,6 +99,9 @@ def deviation_text(found: Assessment, points_mm: F2) -> str:
         notes = [f"# frame: {frame}", f"# verdict: {found_faults}" if found_faults else notes[0]]
     else:
         sources = error_sources(found.joint, found.solved.inputs.as_measured())
+        if found.left_out is not None:
+            sources = without_scales(sources, found.left_out)
+            notes.insert(0, f"# frame: {SCALE_TEXTS[found.left_out]} removed, too")
         p = predict_deviation(sources, points_mm, frame=volume_frame(found.joint.machine))
         deviation, expanded = p.deviation_mm, p.expanded_mm
     rows = zip(points_mm, np.column_stack([deviation, expanded]) * 1e3, strict=True)

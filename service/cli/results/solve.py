@@ -84,6 +84,9 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,
     trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    without_scale: Annotated[
+        bool, typer.Option("--without-scale", help="Leave scales that the runs hardly tell out of --grid, --tables and --at.")
+    ] = False,
     details: Annotated[bool, typer.Option("--details", help="Also print all parameters, comparisons, noise, and what is missing.")] = False,
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
@@ -104,7 +107,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     # A folder and another database may be of another machine: its file has to be named.
     file = machine if db is not None or is_folder(campaign) else named_machine(machine)
     points, target = (None, None) if at is None else (read_points(at).axes_mm, out)
-    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, file, target)
+    wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, file, target, without_scale)
     if is_folder(campaign):
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
@@ -159,6 +162,7 @@ class _SolveRequest:
     points_mm: F2 | None
     machine: Path | None
     out: Path | None
+    without_scale: bool
 
 
 @contextmanager
@@ -218,8 +222,10 @@ def _more(summary: Assessment, wanted: _SolveRequest, report_stage: Callable[[st
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials or wanted.out):
         return out
-    from abbe.service.identification.solve_tables import deviation_text, grid_text, machine_grid, monte_carlo, table_rows
+    from abbe.service.identification.solve_tables import deviation_text, grid_text, machine_grid, monte_carlo, scale_free, table_rows
     from abbe.service.rendering.page_file import write_page
+
+    whole, summary = summary, scale_free(summary) if wanted.without_scale else summary
 
     if wanted.grid is not None:
         report_stage(f"grid of {wanted.nodes} x {wanted.nodes} x {wanted.nodes} nodes")
@@ -230,7 +236,7 @@ def _more(summary: Assessment, wanted: _SolveRequest, report_stage: Callable[[st
         report_stage("what each kind of table could reach")
         out["tables"] = table_rows(summary, wanted.unit_mm)
     if wanted.trials:
-        out["monte_carlo"] = monte_carlo(summary, report_stage)
+        out["monte_carlo"] = monte_carlo(whole, report_stage)
     return out
 
 

@@ -79,6 +79,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     without_table: Annotated[
         bool, typer.Option("--without-table", help="I know that no correction was in force while this was measured.")
     ] = False,
+    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out the scales that the runs hardly tell.")] = False,
     sign: Annotated[
         Path | None,
         typer.Option("--sign", metavar="KEY", help="Private key that signs for this machine; writes FILE.sig.", show_default=False),
@@ -99,6 +100,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         formats_in,
         identified,
         reference_of,
+        scale_note,
         sign_files,
         sign_is_turned,
         write_files,
@@ -106,23 +108,24 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     from abbe.service.verification.reduction import UNKNOWN
 
     doc = _solution(solution, db, machine)
-    known = identified(doc)
+    known = identified(doc, without_scale=without_scale)
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
     fresh = _fresh(solution, db, machine, confirmed_none=without_table)
     made = export(
         known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN, turned=sign_is_turned(step_moved)
     )
+    notes = [*made.notes, *scale_note(doc, without_scale=without_scale)]
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:
         written.append(str(sign_files(out, form, config, seal, SystemClock().utc())))
     if as_json:
-        print_json({"files": written, "choices": [_choice(c) for c in made.choices], "notes": list(made.notes)})
+        print_json({"files": written, "choices": [_choice(c) for c in made.choices], "notes": notes})
         return
     headings = ("tables", "left: rms (µm)", "largest (µm)", "numbers", "")
     rows = [(c.kind, f"{c.rms_mm * 1e3:.2f}", f"{c.max_mm * 1e3:.2f}", str(c.numbers), "written" if c.best else "") for c in made.choices]
     print_table(headings, rows, title="identified error that is left over the volume, both directions, rigid motion removed")
-    for note in made.notes:
+    for note in notes:
         typer.echo(f"- {note}")
     typer.echo(f"wrote {', '.join(written)}")
     conclude(f"abbe comp import {quote(str(out))} --format {form} --solution {quote(solution)}", machine=machine, db=db)

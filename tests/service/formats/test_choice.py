@@ -153,6 +153,30 @@ def test_export_and_import_by_the_commands(key: str, tmp_path: Path, capsys: pyt
     assert max(told["differences_um"].values()) <= 0.51 * unit + 1e-3
 
 
+def test_tables_without_a_scale_that_the_runs_hardly_tell(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """A common scale of 50 µm/m on top changes nothing in tables that leave the common scale out."""
+    known = _known()
+    scale = np.zeros(len(known.terms))
+    for a, axis in enumerate("XYZ"):  # a Legendre polynomial of order 1 rises by 2 over the stroke
+        scale[[t.name for t in known.terms].index(f"E{axis}{axis}.1")] = 50e-6 * np.ptp(STROKE[a]) / 2.0
+    u = {"worst_point": {"expanded_vector_um": 73.0}, "without_scale": {"scales": "common", "expanded_vector_um": 13.0}}
+    stretched, files = replace(known, coefficients=known.coefficients + scale), []
+    for k, machine in enumerate((known, stretched)):
+        source, out = tmp_path / f"{k}.json", tmp_path / f"out{k}"
+        source.write_text(json.dumps(_document(machine) | {"uncertainty": u}))
+        export = ["comp", "export", str(source), "--format", "linuxcnc", "--out", str(out)]
+        assert run([*export, "--without-scale"]) == 0
+        assert "the common scale: left out, and not corrected; the rest is known to ± 13 µm" in capsys.readouterr().out
+        files.append((out / "x.comp").read_text())
+        assert run([*export[:-1], str(tmp_path / f"whole{k}")]) == 0
+        assert "--without-scale leaves it out" in capsys.readouterr().out
+    assert files[0] == files[1] != (tmp_path / "whole0" / "x.comp").read_text()
+
+    source.write_text(json.dumps(_document(known)))
+    assert run([*export, "--without-scale"]) == 2
+    assert "knows the scales no worse than the rest" in capsys.readouterr().err
+
+
 def test_the_measured_step_turns_the_sign_where_no_manual_states_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     source = tmp_path / "solution.json"
     source.write_text(json.dumps(_document(_known())))

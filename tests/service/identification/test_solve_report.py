@@ -1,11 +1,19 @@
 """The one word for a solution: what layout, uncertainty reached, flags and residuals make of it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
+from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observability.volume import Number
 from abbe.models.uncertainty.prediction import Prediction
-from abbe.service.identification.solve_report import VERDICTS, verdict
+from abbe.service.errors import TableRefused
+from abbe.service.identification.solve import Solved
+from abbe.service.identification.solve_report import VERDICTS, assess, solution_of, solution_verdict, verdict
+from abbe.service.identification.solve_tables import deviation_text, scale_free
+from tests.experiments.campaigns.population import draw_case
+from tests.experiments.campaigns.scoring import INPUTS
 
 
 def layout(value: float, word: str) -> Number:
@@ -59,3 +67,34 @@ def test_more_weak_points_never_make_it_better():
     all_of_them = verdict(layout(4.0, "usable with care"), known(0.02, 0.025), 0.3, flags=1, not_noise=1)
     assert all_of_them.word == VERDICTS[0]
     assert len(all_of_them.reasons) == 5
+
+
+def assessed(kind: str):
+    case = draw_case(8, kind)
+    runs = [replace(r, length_calibrated=False, u_length_mm=None) if r.kind == "bar" else r for r in case.runs]
+    return assess(Solved(solve_joint(case.machine, tuple(runs), model="rigid6"), {}, {}, 1e-3, inputs=INPUTS))
+
+
+def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
+    found = assessed("ballbar_only")
+    free, stated = scale_free(found), solution_of(found).uncertainty
+    assert free.left_out == stated.without_scale.scales == "common"
+    assert stated.without_scale.rms_um < 0.71 * stated.rms_um
+    largest = stated.without_scale.expanded_vector_um
+    assert f"without the common scale, which these runs hardly tell, 9 µm rms known to ± {largest:.2g} µm" in solution_verdict(found).text
+    assert free.observability.number.value > found.observability.number.value
+    assert "without" not in solution_verdict(free).text
+
+    points = found.prediction.points_mm
+    whole, rest = (deviation_text(one, points) for one in (found, free))
+    assert "# frame: the common scale removed, too" in rest
+    assert "# frame" not in whole
+    u = [np.genfromtxt(text.splitlines(), delimiter=",", comments="#", names=True)["U_dx_um"] for text in (whole, rest)]
+    assert np.sum(u[1] ** 2) < np.sum(u[0] ** 2)
+
+
+def test_bar_and_laser_together_know_the_scale_and_nothing_is_left_out():
+    found = assessed("joint")
+    assert solution_of(found).uncertainty.without_scale is None
+    with pytest.raises(TableRefused, match="know the scales no worse than the rest"):
+        scale_free(found)
