@@ -129,9 +129,9 @@ class ArtefactPoints:
     step_s: float = float("inf")
 
     @property
-    def sign(self) -> float:
-        """Sign of the machine's deviation in the reading."""
-        return -1.0 if self.source == "probe" else 1.0
+    def direction(self) -> F2:
+        """First-order derivative of every reading by the machine's deviation, shape (n, 3); zero for a calibrated length."""
+        return np.asarray({"probe": -1.0, "cmm": 1.0, "length": 0.0}[self.source] * self.matrix.T[self.component])
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,9 +110,7 @@ def _with(runs: tuple[RunData, ...], fine: tuple[Fine, ...]) -> tuple[RunData, .
 
 def _sensed(runs: tuple[RunData, ...]) -> list[tuple[RunData, F2]]:
     """Runs of points with the machine direction that each row reads, (n, 3)."""
-    return [
-        (r, r.points.sign * r.points.matrix.T[r.points.component]) for r in runs if r.points is not None and r.points.source != "length"
-    ]
+    return [(r, r.points.direction) for r in runs if r.points is not None and r.points.source != "length"]
 
 
 def _nuggets(runs: tuple[RunData, ...]) -> tuple[Fine, ...]:
@@ -133,7 +131,7 @@ def _columns(runs: tuple[RunData, ...], fine: tuple[Fine, ...]) -> F2:
         if r.points is None or r.points.source == "length":
             blocks.append(np.zeros((r.deviation_mm.size, len(fine))))
             continue
-        way = r.points.sign * r.points.matrix.T[r.points.component]
+        way = r.points.direction
         blocks.append(np.stack([way[:, f.component] * f.values(r.axes_mm) for f in fine], axis=1))
     return np.concatenate(blocks)
 

@@ -246,13 +246,16 @@ def _weights(solution: JointSolution) -> list[F1]:
 
 
 def _wave(run: RunData, axis: int, component: int, frequency: F1) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
-    """Reading of exp(2 pi i f x) of a translational motion, shape (n, frequencies): laser against its first record, bar against its cup."""
+    """Reading of exp(2 pi i f x) of a translational motion, shape (n, frequencies): laser against its first record, bar against its cup,
+    artefact in space."""
 
     def at(x_mm: F1) -> np.ndarray[tuple[int, ...], np.dtype[np.complex128]]:
         return np.exp(2j * np.pi * np.multiply.outer(x_mm, frequency))
 
     if run.beam is not None:
         return np.asarray((at(run.axes_mm[:, axis]) - at(run.axes_mm[:1, axis])) * run.beam[component])
+    if run.points is not None:
+        return np.asarray(at(run.axes_mm[:, axis]) * run.points.direction[:, component, None])
     assert run.centre_mm is not None
     bar = run.axes_mm - run.centre_mm
     share = bar[:, component] / np.linalg.norm(bar, axis=1)
