@@ -22,6 +22,7 @@ from abbe.drivers.api import TableController, TableFormat
 from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.models.machine import AXES
+from abbe.models.uncertainty.scales import SCALE_TEXTS
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.clock import Clock, SystemClock, utc_text
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
@@ -31,7 +32,8 @@ from abbe.service.domain.run import Run
 from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
-from abbe.service.identification.solve_report import solution_doc
+from abbe.service.identification.solve_report import assess, solution_doc
+from abbe.service.identification.solve_tables import scale_free
 from abbe.service.identification.table_removal import CampaignTable
 from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest, reasons_against
 from abbe.service.runs.columns import load_run
@@ -148,12 +150,16 @@ GRID = (25, 21, 19)
 
 @dataclass(frozen=True)
 class Proposal:
-    """Tables from a campaign (absolute, rounded), what they add to the tables in force (``change``, unrounded), and the prediction."""
+    """Tables from a campaign (absolute, rounded), what they add to the tables in force (``change``, unrounded), and the prediction.
+
+    ``left_out``: what was left out of the tables, in words.
+    """
 
     solved: Solved
     tables: NineTables
     change: NineTables
     predicted: Predicted
+    left_out: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
@@ -199,7 +205,7 @@ async def gather(controller: TableController, store: Store, site: Site, campaign
     return GatheredCampaign(record, records, runs, base, await controller.table_format())
 
 
-async def make(
+async def make(  # noqa: PLR0913 - every one of them is a choice of the caller, all with a default
     store: Store,
     site: Site,
     gathered: GatheredCampaign,
@@ -208,16 +214,18 @@ async def make(
     progress: ProgressSink,
     agree: Callable[[Predicted], None] = lambda _: None,
     by: str = "",
+    without_scale: bool = False,
 ) -> StoredProposal:
     """Solve, and store the tables as a proposal together with every present reason against it.
 
     ``agree`` receives the prediction; if it raises, nothing is stored. ``by``: the proposer; default: the account of this process.
+    ``without_scale``: as for `propose`.
     """
     clock = clock or SystemClock()
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
     name, base, form = gathered.campaign.name, gathered.base, gathered.form
     known = await asyncio.to_thread(_campaign_without_known_effects, store, name, base.tables)
-    proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm)
+    proposal = await asyncio.to_thread(propose, site, known.campaign.runs, base, form.lsb_nm, without_scale=without_scale)
     agree(proposal.predicted)
     doc = solution_doc(proposal.solved) | known.doc | {"machine": site.doc}
     solution_id = await store.write(store.solutions.add, gathered.campaign.id, "joint", [r.id for r in gathered.records], doc)
@@ -228,7 +236,7 @@ async def make(
     proposed = Proposed(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
         BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
-        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)), known.lines,
+        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)), (*known.lines, *proposal.left_out),
         proposal.solved.holds_at,
     )  # fmt: skip
     plain = doc_of(proposed)
@@ -242,20 +250,32 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
     return min(used, default=0.0), max(used, default=0.0)
 
 
-def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int) -> Proposal:
+def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_scale: bool = False) -> Proposal:
     """Solve runs that were measured while ``base`` was active, and add their correction to it. ``lsb_nm``: the controller's unit, nm.
+
+    ``without_scale``: leave out the scales that are the largest part of the uncertainty; the tables in force keep theirs.
 
     Raises
     ------
     TableRefused
-        The readings cannot carry the map.
+        The readings cannot carry the map, or (``without_scale``) the scales are not what they know worst.
     """
     solved = solve_runs(site, runs)
     if beyond := beyond_the_prior(solved.joint):
         raise TableRefused(f"no tables from a map that the readings cannot carry: {beyond.what}", f"{beyond.remedy}; nothing was written")
-    change = nine_tables(solved.joint, GRID)
-    predicted = predict_residual(solved.joint, change)
-    return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted)
+    change, predicted, left_out = change_of(solved, without_scale=without_scale)
+    return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted, left_out)
+
+
+def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTables, Predicted, tuple[str, ...]]:
+    """Return what a solution adds to the tables in force, the prediction, and what is left out, in words; as for `propose`."""
+    if not without_scale:
+        change = nine_tables(solved.joint, GRID)
+        return change, predict_residual(solved.joint, change), ()
+    free = scale_free(assess(solved))
+    sources, text = free.sources, SCALE_TEXTS[free.left_out or "common"]
+    change = nine_tables(sources.solution, GRID, sources=sources)
+    return change, predict_residual(sources.solution, change, sources=sources), (f"{text}, which the runs hardly tell: left out",)
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:

@@ -35,6 +35,7 @@ ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Numbe
 
 def propose(
     campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Identification campaign in the store.")],
+    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out the scales that the runs hardly tell.")] = False,
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -45,6 +46,7 @@ def propose(
     from abbe.service.compensation.proposals import gather, make
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
+    from abbe.service.identification.solve_report import assess
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
@@ -55,11 +57,14 @@ def propose(
         store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
-                return await make(store, site, await gather(session.controller, store, site, campaign), progress=sink)
+                gathered = await gather(session.controller, store, site, campaign)
+                return await make(store, site, gathered, progress=sink, without_scale=without_scale)
 
     with Store.open(loaded.database_url) as store:
         made = run_job(work(store))
         _print_made(store, made, as_json=as_json)
+    if made.proposed.reasons and not without_scale and not as_json and assess(made.solved).scale_free is not None:
+        typer.echo(f"the runs hardly tell the scales; tables of all the rest: abbe comp propose {quote(campaign)} --without-scale")
     conclude(f"abbe comp {'show' if made.proposed.reasons else 'diff'} {made.number}", machine=machine, as_json=as_json)
     raise typer.Exit(1 if made.proposed.reasons else 0)
 

@@ -5,9 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.geometry.volume import volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.solvers.observability.volume import Number
 from abbe.models.uncertainty.prediction import Prediction
+from abbe.service.compensation.proposals import change_of
 from abbe.service.errors import TableRefused
 from abbe.service.identification.solve import Solved
 from abbe.service.identification.solve_report import VERDICTS, assess, solution_of, solution_verdict, verdict
@@ -84,6 +86,14 @@ def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
     assert f"without the common scale, which these runs hardly tell, 9 µm rms known to ± {largest:.2g} µm" in solution_verdict(found).text
     assert free.observability.number.value > found.observability.number.value
     assert "without" not in solution_verdict(free).text
+
+    (change, promised, left_out), (_, whole, nothing) = (change_of(found.solved, without_scale=k) for k in (True, False))
+    assert left_out == ("the common scale, which the runs hardly tell: left out",)
+    assert nothing == ()
+    assert promised.u_model_mm < 0.71 * whole.u_model_mm
+    assert promised.after_mm < promised.before_mm
+    at = volume_grid(found.joint.machine.stroke_mm, 5)
+    assert abs(np.sum(change.correction_at(at) * (at - at.mean(axis=0)))) < 1e-9 * np.sum((at - at.mean(axis=0)) ** 2)  # stretches nothing
 
     points = found.prediction.points_mm
     whole, rest = (deviation_text(one, points) for one in (found, free))
