@@ -5,12 +5,14 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import SMOOTH_ORDER
 from abbe.models.geometry.chain import design
 from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import Fine
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.poses import pose_rank
 from abbe.models.solvers.plate_fit import plate_fit
+from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 
 SENSED = 1e-3
 """An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
@@ -51,7 +53,7 @@ def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2,
     """Return deviation and expanded uncertainty (k = 2) at points, mm, shape (n, 3) each, NaN where not sensed, and the frame in words."""
     tool = next(run.tool_mm for run in joint.data if run.points is not None and run.points.source != "length")
     at, chosen = design(with_tool(joint.machine, tool), joint.terms, points_mm), np.arange(len(joint.terms))
-    waves, scatter_mm = _fine(joint)
+    waves, scatter_mm = _fine(joint, points_mm)
     names = joint.estimate.names
     if waves:
         chosen = np.concatenate([chosen, [names.index(w.name) for w in waves]])
@@ -81,14 +83,29 @@ def _offered(value_mm: F2, u_mm: F2) -> float:
     return float(np.clip((NOTHING_FROM - doubt) / (NOTHING_FROM - WHOLE_TO), 0.0, 1.0))
 
 
-def _fine(joint: JointSolution) -> tuple[tuple[Fine, ...], F1]:
+def _fine(joint: JointSolution, points_mm: F2) -> tuple[tuple[Fine, ...], F1]:
     """Return the waves of the machine's motions, and for each direction what changes from one position to the next, mm."""
     fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
     scatter = np.zeros(3)
     for one in fine:
         if not one.period_mm:
             scatter[one.component] = joint.prior_sd[joint.estimate.names.index(one.name)]
-    return tuple(one for one in fine if one.period_mm), scatter
+    moving = np.ptp(points_mm, axis=0) > SENSED
+    return tuple(one for one in fine if one.period_mm), np.hypot(scatter, np.sqrt(moving @ _above_rough(joint)))
+
+
+def _above_rough(joint: JointSolution) -> F1:
+    """Return the variance of a rough motion of each axis above the orders of the model, mm^2, shape (3,); zero without rough motions."""
+    last = max(t.order for t in joint.terms)
+    if last <= SMOOTH_ORDER:
+        return np.zeros(3)
+    size = Priors().rough_mm * joint.size_factors.get("rough", 1.0) * joint.size_factors.get("machine", 1.0)
+    shares = []
+    for length in joint.machine.length_mm:
+        root = rough_root(0, last, ROUGH_LENGTH_MM / float(length))
+        inside = float(((root**2).sum(axis=1) / (2.0 * np.arange(last + 1) + 1.0)).sum())
+        shares.append(size**2 * max(1.0 - inside, 0.0))
+    return np.array(shares)
 
 
 def _frame(points_mm: F2, keep: list[int], *, scale: bool) -> F2:
