@@ -38,7 +38,7 @@ from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
-ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, 2.0
+ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, -1.0
 """Motions are solved for with their rough parts if the score for these exceeds its expectation by so many standard deviations;
 points of artefacts are few, so less is enough."""
 Model = Literal["rigid6", "rigid21", "auto"]
