@@ -84,7 +84,9 @@ class Filled:
 
 def _solved(_folder: Path) -> tuple[Solved, str]:
     site, runs = measured(SEED)
-    solved = solve_runs(site, runs_of(runs))
+    # Four step diagonals would show every motion by itself.
+    diagonals = [run for run in runs if run["test"] == "laser_diagonal"]
+    solved = solve_runs(site, runs_of([run for run in runs if run not in diagonals[1:]]))
     return solved, json.dumps(solution_doc(solved))
 
 

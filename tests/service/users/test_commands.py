@@ -58,6 +58,7 @@ SAMPLES: dict[str, list[str]] = {
     "import": ["import", "none"],
     "model revert": ["model", "revert", "--of", "none", "1"],
     "comp commission": ["comp", "commission", "-m", "m.toml"],
+    "comp drop": ["comp", "drop", "-m", "m.toml", "7", "--to", "nowhere"],
     "comp export": ["comp", "export", "7", "--format", "fanuc", "--out", "x", "--sign", "none.pem"],
     "comp propose": ["comp", "propose", "-m", "m.toml", "none"],
     "comp approve": ["comp", "approve", "7"],
