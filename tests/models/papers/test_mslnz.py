@@ -23,6 +23,9 @@ from scipy.spatial.transform import Rotation
 
 from abbe.models.geometry.chain import all_chains, deviation_mm, exact_deviation_mm
 from abbe.models.machine import Machine
+from abbe.models.solvers.artefact import ArtefactPoints
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observations import RunData
 
 CHAIN = "w-X-b-Y-Z-t"
 STROKE = np.array([[0.0, 800.0], [0.0, 600.0], [0.0, 600.0]])
@@ -132,3 +135,29 @@ def test_every_error_of_the_plate_is_seen(plate):
             continue
         without = deviation_mm(m.machine(), m.nominal, motions(coefficients | {name: [0.0]}, m.nominal))
         assert np.abs(without - m.deviation).max() > 2 * ROUNDING, name
+
+
+def test_the_plate_as_a_part_on_a_cmm_gives_its_coefficients_back_where_one_pose_shows_them(plate):
+    """The joint solution reads the 75 deviations; one pose in XZ shows the scale of X and hides, e.g., everything of Y."""
+    m, coefficients = plate
+    names = tuple(f"B{i:02d}" for i in range(25) for _ in range(3))
+    at, n = np.repeat(m.nominal, 3, axis=0), 75
+    local = m.nominal - m.nominal[0]
+    points = ArtefactPoints(
+        "K", "cmm", np.eye(3), names, np.tile(np.arange(3), 25), np.repeat(local, 3, axis=0), np.zeros((n, 3)), np.zeros(n), 0.0, 0.0,
+        np.full(n, np.nan), 400.0, local.mean(axis=0), calibrated=True, u_cmm_scale=1e-9,
+    )  # fmt: skip
+    run = RunData(
+        "p1", "p1", "artefact", at, m.deviation.ravel(), np.zeros((n, 3)), np.zeros(n), np.full(n, 1e6), tool_mm=m.meta["probe.length"],
+        points=points,
+    )  # fmt: skip
+    joint = solve_joint(m.machine(), (run,), order=1)
+    moved = joint.deviation_mm(m.nominal, m.meta["probe.length"])
+    exact = deviation_mm(m.machine(), m.nominal, motions(coefficients, m.nominal))
+    assert np.abs(m.deviation.ravel() - joint.runs[0].residual_mm - exact.ravel()).max() <= ROUNDING
+    away = np.column_stack([np.ones(25), local])
+    for k in (0, 2):  # along X and Z: the scale that was planted, as a slope along its own axis
+        slopes = [np.linalg.lstsq(away[:, [0, 1, 3]], d[:, k], rcond=None)[0][1 if k == 0 else 2] for d in (moved, exact)]
+        assert slopes[0] == pytest.approx(slopes[1], abs=0.3e-6)
+    assert joint.identifiability.rank < len(joint.terms)
+    assert any(name.startswith("EYY") for name in joint.identifiability.involved)  # nothing moved along Y
