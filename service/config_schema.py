@@ -144,6 +144,9 @@ class Limits(Section):
     table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
         default=20.0, description="largest change between neighbouring grid points"
     )
+    table_beyond_percent: Annotated[float, Field(ge=0.0, le=100.0)] = Field(
+        default=25.0, description="largest part of a stroke that a table corrects beyond the measured positions, at either end"
+    )
     table_walk_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
         default=50.0, description="largest change of a correction over 30 days by unattended pushes ([alarm] push)"
     )

@@ -105,6 +105,7 @@ def push_limits(limits: Limits) -> PushLimits:
     """Return the machine file's limits for tables, in mm."""
     return PushLimits(
         value_mm=limits.table_value_um * 1e-3,
+        beyond=limits.table_beyond_percent * 1e-2,
         change_mm=limits.table_change_um * 1e-3,
         step_mm=limits.table_step_um * 1e-3,
         walk_mm=limits.table_walk_um * 1e-3,

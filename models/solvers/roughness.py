@@ -93,12 +93,7 @@ def rough_motions(solution: JointSolution) -> tuple[RoughMotion, ...]:
 
 
 def rough_lines(solution: JointSolution) -> tuple[str, ...]:
-    """What is rough, in sentences: periods, motions, or only the size if the readings do not tell which motions it concerns.
-
-    None of artefacts: their periods are unknowns of the solution (`abbe.models.solvers.fine`).
-    """
-    if any(run.points is not None for run in solution.data):
-        return ()
+    """What is rough, in sentences: periods, motions, or only the size if the readings do not tell which motions it concerns."""
     rough = any(t.order > SMOOTH_ORDER for t in solution.terms)
     if not rough and not any(test.flagged for test in solution.residual_tests):
         return ()

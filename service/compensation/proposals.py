@@ -94,8 +94,16 @@ def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
         mark_of(r.table.boot_id for r in used), known,
-        promise.last_s,
+        promise.last_s, _reached_mm(used),
     )  # fmt: skip
+
+
+def _reached_mm(runs: list[Run]) -> tuple[tuple[float, float], ...]:
+    """Lowest and highest position of each axis in these runs, mm."""
+    if not runs:
+        return ()
+    places = np.concatenate([r.columns.q_mm[r.columns.valid] for r in runs])
+    return tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0), strict=True))
 
 
 def _instruments(runs: list[Run]) -> set[str]:

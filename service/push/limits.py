@@ -25,6 +25,8 @@ class PushLimits:
         Largest second difference.
     gain, k : float
         Smallest predicted improvement of the rms: relative; and as a multiple of the model's standard uncertainty.
+    beyond : float
+        Largest part of a stroke, 0 to 1, that a table corrects beyond the positions of the runs, at either end.
     share : float
         Largest standard uncertainty of the model as a share of the predicted improvement.
     age_h, temperature_c, drift_mm, runs : float, pair, float, int
@@ -47,6 +49,7 @@ class PushLimits:
     runs: int = 3
     unattended_h: float = 24.0
     walk_mm: float = 0.05
+    beyond: float = 0.25
 
     def digest(self) -> str:
         """SHA-256 of the limits. An approval binds it, and so does not hold under other limits."""

@@ -49,6 +49,7 @@ class TableEvidence:
     ``before_mm``, ``after_mm``, ``u_mm``: predicted rms without and with the table, and the model's standard uncertainty. ``drift_mm``: rms
     residual of the solution in a newer run, 0 without one. ``temperature_c``: lowest and highest air temperature. ``ended_s``, ``last_s``:
     end of the oldest and of the newest run, seconds UTC; ``last_s`` None: the same as ``ended_s``.
+    ``reached_mm``: lowest and highest position of each axis in the runs; empty if it is not known.
     """
 
     run_count: int
@@ -61,6 +62,7 @@ class TableEvidence:
     machine_mark: str
     calibrated_until_s: tuple[float, ...]
     last_s: float | None = None
+    reached_mm: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -212,6 +214,20 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
         yield "CERTIFICATE: the instruments have no calibration certificate"
     elif not min(e.calibrated_until_s) >= newest_s:
         yield "CERTIFICATE: a calibration had expired when it was measured"
+    yield from _reach(c, context, limits)
+
+
+def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
+    """Yield the reason for each axis of which the table corrects much that no run reached: there the map is only assumed."""
+    for axis, (low, high) in zip(AXES, c.evidence.reached_mm, strict=False):
+        grid = next((column.position_mm for column in c.columns if column.moved == axis and column.position_mm), (low,))
+        travel = context.travel_mm[axis][1] - context.travel_mm[axis][0]
+        beyond = max(low - grid[0], grid[-1] - high) / travel
+        if not beyond <= limits.beyond:
+            yield (
+                f"REACH: the runs moved {axis} from {low:.0f} to {high:.0f} mm, the table corrects {beyond:.0%} of the stroke beyond, "
+                f"allowed are {limits.beyond:.0%} ([limits] table_beyond_percent)"
+            )
 
 
 def drift_reason(drift_mm: float, limits: PushLimits) -> str:

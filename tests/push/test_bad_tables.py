@@ -79,6 +79,17 @@ def test_the_reference_stays_where_it_is(units: int, refused: bool) -> None:
         assert [reason.split(":")[0] for reason in reasons] == ["REFERENCE"] * refused, at
 
 
+def test_a_table_beyond_what_was_measured_needs_the_word_of_the_machine_file() -> None:
+    """The table corrects X from 0 to 640 of 800 mm; the runs left 224 mm (28 %) of that at its end."""
+    candidate, context = good(Random(4))
+    reached = ((0.0, 416.0), (0.0, 640.0), (160.0, 640.0))
+    made = signed(replace(candidate, evidence=replace(candidate.evidence, reached_mm=reached)))
+    (reason,) = reasons_against(made, context, LIMITS)
+    assert reason.startswith("REACH: the runs moved X from 0 to 416 mm, the table corrects 28% of the stroke beyond, allowed are 25%")
+    assert "table_beyond_percent" in reason
+    assert reasons_against(made, context, replace(LIMITS, beyond=0.28)) == []
+
+
 def test_all_reasons_are_told_at_once() -> None:
     candidate, context = good(Random(5))
     bad = signed(replace(candidate, machine="other", lsb_nm=1, evidence=replace(candidate.evidence, run_count=0)))
