@@ -30,10 +30,6 @@ NOISE_SD = 2.0
 LEAST_ETA = -8.0
 """Least log ratio of noise variance to expected one, a factor of 55 in the standard deviation and below any instrument's resolution.
 Readings without noise would drive it to minus infinity, and the normal equations beyond double precision."""
-IGNORANCE = 1.0
-"""Ignorance alone makes the size of a motion at most this many times as large as documented (`cautious`)."""
-ROUGHER = 0.0
-"""A motion is taken less smooth than most probable by this many posterior standard deviations of its smoothness (`cautious`)."""
 CLEAR = 1.5
 """Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25
@@ -328,25 +324,22 @@ def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> t
 def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
     """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    It differs in three ways, none of which matters with many readings.
+    It differs in two ways, none of which matters with many readings.
 
-    - Every motion is a little less smooth (`ROUGHER`) than most probable: near the ends of the stroke, where nothing was measured, it may
-      be rougher without contradicting the readings.
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
-      that the readings hardly separate, the most probable sizes are too small. Ignorance alone makes
-      it at most `IGNORANCE` times the documented one.
+      that the readings hardly separate, the most probable sizes are too small. Ignorance alone makes it at most the documented one.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("smoothness ") for name in model.names])
     sd = np.sqrt(found.spread.diagonal()[: rough.size])
-    psi = found.components.psi - np.where(rough, ROUGHER * sd, 0.0)
-    psi += np.where(np.array(model.names) == "slope", np.clip(-psi, 0.0, 0.5 * sd**2), 0.0)
+    psi = found.components.psi
+    psi = psi + np.where(np.array(model.names) == "slope", np.clip(-psi, 0.0, 0.5 * sd**2), 0.0)
     c = Components(np.clip(psi, model.low, model.high), found.components.eta)
     sizes = model.design * ~rough
     unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
     factor = np.ones(model.typical.size)
     for at in model.blocks:
-        scale = np.minimum(np.exp(0.25 * unsure[at]), np.maximum(IGNORANCE / c.half(model)[at], 1.0))
+        scale = np.minimum(np.exp(0.25 * unsure[at]), np.maximum(1.0 / c.half(model)[at], 1.0))
         prior_size = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
         factor[at] = scale * np.hypot(prior_size, SMALLEST_BEND) / prior_size
     return replace(model, root=model.root * factor), c

@@ -24,7 +24,7 @@ MOST_PLACES = 80
 """An axis with more places in a run is read so densely that a basis can follow it."""
 FEWEST_PLACES = 3
 LEAST_SHARE = 1e-3
-"""A motion at a smaller angle to being perpendicular to the beam is not seen."""
+"""A motion of which the beam sees a smaller share is left out."""
 
 
 def with_details(setup: SetupUnknowns, runs: tuple[RunData, ...], priors: Priors) -> SetupUnknowns:

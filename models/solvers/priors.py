@@ -106,13 +106,12 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
-LARGEST_SIZE = 5.0
-"""The size of a class is never estimated above `LARGEST_SIZE` times the documented one, that of error motions never below 1 / as much."""
+LARGEST_SIZE, SMALLEST_SIZE = 5.0, 0.07
+"""Bounds of the estimated size of a class relative to the documented one; set-ups and lost motion have no lower one."""
 MOTION_FACTOR = 2.5
 """Hyperprior of the size of one error motion relative to its class: known within this factor."""
 LARGEST_MOTION = 5.0
-"""One error motion is never estimated more than this many times as large as its class."""
-SMALLEST_SIZE = 0.07
+"""One error motion is never estimated more than this many times as large as its class, nor less than 1 / `LARGEST_SIZE` as large."""
 SMOOTHNESS_SD = 0.7
 """Hyperprior of how much faster than documented the sizes of one motion fall with the order; never slower (`SizeModel.low`)."""
 ORDER_SD, LEAST_ORDER, LARGEST_ORDER = 1.0, -6.0, 1.0
