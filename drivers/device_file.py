@@ -60,13 +60,13 @@ Pattern = Annotated[str, AfterValidator(_regular)]
 Text = Annotated[str, AfterValidator(_escaped)]
 
 
-class Table(BaseModel):
+class DeviceTable(BaseModel):
     """Base of all tables of a device file: unknown keys are errors."""
 
     model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
 
 
-class Value(Table):
+class DeviceValue(DeviceTable):
     """One value: where it is found, and what a count of it means: value = sign * scale * count + offset, in ``unit``."""
 
     address: Register | None = Field(default=None, description="Modbus: first register, from 0; a line's values are groups of its pattern")
@@ -78,7 +78,7 @@ class Value(Table):
     offset: float = Field(default=0.0, description="in the unit")
 
 
-class Known(Table):
+class IdentityRegisters(DeviceTable):
     """Registers whose content identifies the device. Several registers with a content without symmetry also prove the byte order."""
 
     address: Register
@@ -95,7 +95,7 @@ class Known(Table):
         return self
 
 
-class Flag(Table):
+class Flag(DeviceTable):
     """What it means that a value has a bit set, or lies outside of limits (in the value's unit)."""
 
     value: str = Field(description="name of a value in [values]")
@@ -112,7 +112,7 @@ class Flag(Table):
         return self
 
 
-class Command(Table):
+class Command(DeviceTable):
     """A command, sent once and never repeated, and how the device acknowledges it.
 
     Modbus: ``write`` goes to ``address`` on; with ``numbered`` a number goes before it, one more than that register holds, and the register
@@ -131,7 +131,7 @@ class Command(Table):
     within_s: float = Field(default=1.0, gt=0, le=30)
 
 
-class ModbusTable(Table):
+class ModbusTable(DeviceTable):
     """Modbus TCP or RTU. The address and unit stand in the URL."""
 
     order: Order = Field(description="bytes of a value of two registers: ABCD is high register first, CDAB low register first")
@@ -142,7 +142,7 @@ class ModbusTable(Table):
     timeout_s: float = Field(default=1.0, gt=0, le=10)
 
 
-class LineTable(Table):
+class LineTable(DeviceTable):
     """Lines of text over a serial port or TCP. The port stands in the URL."""
 
     mode: Literal["poll", "stream"]
@@ -159,7 +159,7 @@ class LineTable(Table):
     timeout_s: float = Field(default=1.0, gt=0, le=10)
 
 
-class Limits(Table):
+class PromisedLimits(DeviceTable):
     """What the manual promises. Absent: not promised."""
 
     rate_hz: float = Field(gt=0, le=1000, description="readings per second that the device allows")
@@ -169,7 +169,7 @@ class Limits(Table):
     u: float | None = Field(default=None, gt=0, description="standard uncertainty of a reading by the manual, in its unit")
 
 
-class DeviceFile(Table):
+class DeviceFile(DeviceTable):
     """The protocol of one kind of device."""
 
     format: Literal["abbe-device/1"]
@@ -182,15 +182,15 @@ class DeviceFile(Table):
     )
     modbus: ModbusTable | None = None
     line: LineTable | None = None
-    identity: tuple[Known, ...] = ()
-    serial_no: Value | None = Field(default=None, description="Modbus: registers of the serial number")
-    boot: Value | None = Field(default=None, description="Modbus: registers that change with every start of the device")
-    values: dict[str, Value]
+    identity: tuple[IdentityRegisters, ...] = ()
+    serial_no: DeviceValue | None = Field(default=None, description="Modbus: registers of the serial number")
+    boot: DeviceValue | None = Field(default=None, description="Modbus: registers that change with every start of the device")
+    values: dict[str, DeviceValue]
     flags: tuple[Flag, ...] = ()
     zero: Command | None = Field(default=None, description="sets the displacement to zero; absent: Abbe subtracts the reading")
     clear: Command | None = Field(default=None, description="clears a latched error")
     compensate: Command | None = Field(default=None, description="switches the correction for the air on")
-    limits: Limits
+    limits: PromisedLimits
 
     @model_validator(mode="after")
     def _whole(self) -> Self:
@@ -230,7 +230,7 @@ ONE_REQUEST = 125
 """Registers that one Modbus request can read."""
 
 
-def core_values(file: DeviceFile) -> dict[str, Value]:
+def core_values(file: DeviceFile) -> dict[str, DeviceValue]:
     """Return the values that must come from one request, so that they belong to the same moment: measured, counter, time and flags."""
     names = {*NEEDED[file.kind], "counter", "time", "signal", *(flag.value for flag in file.flags)}
     return {name: value for name, value in file.values.items() if name in names}

@@ -58,13 +58,13 @@ EXCLUSIVE_KEYS = {
 Certificate = Annotated[date | None, AfterValidator(_certificate)]
 
 
-class Section(BaseModel):
+class ConfigTable(BaseModel):
     """A table of the machine file: no unknown key, no NaN, immutable."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
-class AxisIntervals(Section):
+class AxisIntervals(ConfigTable):
     """One interval of commanded coordinates for each axis, mm."""
 
     X: Interval
@@ -72,7 +72,7 @@ class AxisIntervals(Section):
     Z: Interval
 
 
-class AxisPoints(Section):
+class AxisPoints(ConfigTable):
     """One point for each carriage, mm."""
 
     X: Point = (0.0, 0.0, 0.0)
@@ -80,7 +80,7 @@ class AxisPoints(Section):
     Z: Point = (0.0, 0.0, 0.0)
 
 
-class Devices(Section):
+class Devices(ConfigTable):
     """Addresses of the devices; an absent one is not connected."""
 
     ballbar: str | None = Field(default=None, description="serial:///dev/ttyUSB0?baud=460800 or socket://host:port")
@@ -115,7 +115,7 @@ def _database(text: str) -> str:
     return text
 
 
-class StoreSection(Section):
+class StoreSection(ConfigTable):
     """Where results are stored."""
 
     url: Annotated[str, AfterValidator(_database)] = Field(
@@ -132,7 +132,7 @@ class StoreSection(Section):
     keep_segments: bool = Field(default=False, description="keep the capture files after their samples are in the database")
 
 
-class Limits(Section):
+class Limits(ConfigTable):
     """Limits that must never be exceeded. A table beyond a limit is refused, not clamped."""
 
     table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=100.0, description="largest correction at any grid point")
@@ -173,7 +173,7 @@ class Limits(Section):
     )
 
 
-class AxisCoefficients(Section):
+class AxisCoefficients(ConfigTable):
     """One expansion coefficient for each axis, 1/K; an absent axis is not reduced."""
 
     X: Coefficient | None = None
@@ -181,7 +181,7 @@ class AxisCoefficients(Section):
     Z: Coefficient | None = None
 
 
-class AxisUncertainties(Section):
+class AxisUncertainties(ConfigTable):
     """One standard uncertainty of a coefficient for each axis, 1/K."""
 
     X: CoefficientUncertainty | None = None
@@ -189,7 +189,7 @@ class AxisUncertainties(Section):
     Z: CoefficientUncertainty | None = None
 
 
-class Material(Section):
+class Material(ConfigTable):
     """Thermal expansion, to reduce figures of ISO 230-2 and 230-6 to 20 °C. Without a coefficient and a temperature nothing is reduced."""
 
     scale_per_k: AxisCoefficients = Field(
@@ -242,14 +242,14 @@ class Material(Section):
         }
 
 
-class Calibration(Section):
+class Calibration(ConfigTable):
     """Last days of the instruments' certificates. No table is written from an instrument without a valid certificate."""
 
     ballbar: Certificate = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
     laser: Certificate = Field(default=None, description="of the laser")
 
 
-class IssuerSection(Section):
+class IssuerSection(ConfigTable):
     """Who issues digital calibration certificates (`abbe report --out FILE.xml`)."""
 
     laboratory: str = Field(min_length=1, max_length=200)
@@ -262,7 +262,7 @@ class IssuerSection(Section):
     )
 
 
-class Nc(Section):
+class Nc(ConfigTable):
     """The controller that NC programs are written for (`abbe measure --nc`)."""
 
     acceleration_mm_s2: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(
@@ -276,7 +276,7 @@ class Nc(Section):
     )
 
 
-class Verify(Section):
+class Verify(ConfigTable):
     """Limits of the scheduled check: a machine above any of them fails."""
 
     body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
@@ -292,7 +292,7 @@ def _broker(text: str | None) -> str | None:
     return text
 
 
-class Mqtt(Section):
+class Mqtt(ConfigTable):
     """Where results are published."""
 
     url: Annotated[str | None, AfterValidator(_broker)] = Field(
@@ -316,7 +316,7 @@ class Mqtt(Section):
         return self
 
 
-class Web(Section):
+class Web(ConfigTable):
     """Where the web page is served."""
 
     host: str = Field(
@@ -350,7 +350,7 @@ class Web(Section):
         return self
 
 
-class OpcUa(Section):
+class OpcUa(ConfigTable):
     """A read-only OPC UA server that shows the machine to the plant."""
 
     enabled: bool = Field(default=False, description="needs the extra: pip install 'abbe[opcua]'")
@@ -395,7 +395,7 @@ def _public_key(text: str) -> str:
     return text
 
 
-class Signatures(Section):
+class Signatures(ConfigTable):
     """Keys whose signature makes a compensation file more than a candidate."""
 
     trusted: list[Annotated[str, AfterValidator(_public_key)]] = Field(
@@ -403,7 +403,7 @@ class Signatures(Section):
     )
 
 
-class AlarmSection(Section):
+class AlarmSection(ConfigTable):
     """When scheduled checks raise an alarm before a limit is exceeded, and what the service may do about it by itself."""
 
     warn_days: float = Field(
@@ -423,7 +423,7 @@ class AlarmSection(Section):
     )
 
 
-class MachineFile(Section):
+class MachineFile(ConfigTable):
     """One machine: its geometry, its devices, where results go, and the limits that protect it."""
 
     name: str = Field(min_length=1, max_length=200)

@@ -44,7 +44,7 @@ from abbe.service.scheduler import record
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.verification.alarm_states import Signal
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
@@ -256,7 +256,7 @@ class Served:
     base: str
     filled: Filled
     store: Store
-    people: People
+    people: UserAccounts
     auth: Authenticator
     board: Board
     tail: LogTail
@@ -267,7 +267,7 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
     """The page over a filled store, on a real socket, in a thread with its own event loop."""
     clock = SystemClock()
     with Store.open(filled.url) as store:
-        people = People(store, clock, Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, clock, Passwords(memory_kib=64, passes=1))
         for name, role in USERS.items() if users else ():
             if store.people.find(name) is None:
                 people.add(name, role, PHRASE)

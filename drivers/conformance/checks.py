@@ -9,15 +9,15 @@ from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from itertools import pairwise
 
-from abbe.drivers.conformance.probe import Probe, Sample
+from abbe.drivers.conformance.probe import DeviceUnderTest, Sample
 from abbe.drivers.described.meter import INVALID
 from abbe.drivers.described.registers import ORDERS, decode, ours
-from abbe.drivers.described.tested import Finding, Verdict
+from abbe.drivers.described.tested import CheckVerdict, DeviceCheck
 from abbe.drivers.device_file import SIZE, DeviceFile
 from abbe.drivers.errors import DriverError
 
 Ask = Callable[[str], Awaitable[object]]
-PASSED, FAILED, NOT_PROVED = Verdict.PASSED, Verdict.FAILED, Verdict.NOT_PROVED
+PASSED, FAILED, NOT_PROVED = CheckVerdict.PASSED, CheckVerdict.FAILED, CheckVerdict.NOT_PROVED
 SAMPLES = 10
 """Least number of readings at rest, and how long they are taken at least, s."""
 AVERAGED, SETTLED_S = 3, 0.3
@@ -44,28 +44,28 @@ class Move:
     tolerance_mm: float
 
 
-async def identity(probe: Probe, file: DeviceFile | None) -> list[Finding]:
+async def identity(probe: DeviceUnderTest, file: DeviceFile | None) -> list[DeviceCheck]:
     """Identify twice; what identifies the device is its registers, its answer, or nothing."""
     try:
         first, second = await probe.identify(), await probe.identify()
     except DriverError as error:
-        return [Finding("identity", FAILED, str(error))]
+        return [DeviceCheck("identity", FAILED, str(error))]
     if first != second:
-        return [Finding("identity", FAILED, f"it is {first}, then {second}")]
+        return [DeviceCheck("identity", FAILED, f"it is {first}, then {second}")]
     named = f"{first.model} {first.serial_no}".strip()
     if file is not None and not (file.identity or file.serial_no or (file.line is not None and file.line.who)):
-        return [Finding("identity", NOT_PROVED, f"{named}: nothing in the device file tells it from another device")]
-    found = [Finding("identity", PASSED, named)]
+        return [DeviceCheck("identity", NOT_PROVED, f"{named}: nothing in the device file tells it from another device")]
+    found = [DeviceCheck("identity", PASSED, named)]
     if file is not None and file.modbus is not None:
         whole = any(SIZE[known.type] > 1 for known in file.identity)
         text = (
             f"{file.modbus.order}, by the identity registers" if whole else "no known content of two registers; the known motion shows it"
         )
-        found.append(Finding("byte order", PASSED if whole else NOT_PROVED, text))
+        found.append(DeviceCheck("byte order", PASSED if whole else NOT_PROVED, text))
     return found
 
 
-async def rate(probe: Probe, file: DeviceFile | None) -> list[Finding]:
+async def rate(probe: DeviceUnderTest, file: DeviceFile | None) -> list[DeviceCheck]:
     """Take samples as fast as allowed: rate, jitter, freshness, the device's clock, noise."""
     taken: list[Sample] = []
     try:
@@ -73,65 +73,69 @@ async def rate(probe: Probe, file: DeviceFile | None) -> list[Finding]:
         while len(taken) < SAMPLES or taken[-1].host_s - taken[0].host_s < WATCHED_S:
             taken.append(await probe.sample(taken[-1].number if taken else None))
     except DriverError as error:
-        return [Finding("readings", FAILED, f"after {len(taken)} readings: {error}")]
+        return [DeviceCheck("readings", FAILED, f"after {len(taken)} readings: {error}")]
     apart = [b.host_s - a.host_s for a, b in pairwise(taken)]
     mean_s = max(statistics.fmean(apart), 1e-9)
     jitter = f"{statistics.pstdev(apart) * 1e3:.1f} ms standard deviation, {max(apart) * 1e3:.0f} ms longest"
-    found = [Finding("rate", PASSED, f"{1.0 / mean_s:.1f} readings a second; interval {mean_s * 1e3:.1f} ms, {jitter}")]
+    found = [DeviceCheck("rate", PASSED, f"{1.0 / mean_s:.1f} readings a second; interval {mean_s * 1e3:.1f} ms, {jitter}")]
     return [*found, _fresh(file), *_clock(taken), *_noise(taken, file)]
 
 
-def _fresh(file: DeviceFile | None) -> Finding:
+def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if file is None:
-        return Finding("freshness", PASSED, "by its driver")
+        return DeviceCheck("freshness", PASSED, "by its driver")
     stamp = next((name for name in ("counter", "time") if name in file.values), None)
     if stamp is not None:
-        return Finding("freshness", PASSED, f"its {stamp} is checked with every reading")
+        return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")
     if file.line is not None:
-        return Finding(
+        return DeviceCheck(
             "freshness", PASSED, "every reading was the answer to a question" if file.line.mode == "poll" else "a line of its own"
         )
     if file.limits.update_s is not None:
-        return Finding("freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s")
-    return Finding("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
+        return DeviceCheck(
+            "freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s"
+        )
+    return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
 
 
-def _clock(taken: list[Sample]) -> list[Finding]:
+def _clock(taken: list[Sample]) -> list[DeviceCheck]:
     host_s, device_s = taken[-1].host_s - taken[0].host_s, taken[-1].device_s - taken[0].device_s
     if math.isnan(device_s):
         return []
     ratio = device_s / host_s
     good = 1.0 / CLOCK_FACTOR < ratio < CLOCK_FACTOR
     text = f"its time stamps advance {device_s:.2f} s in {host_s:.2f} s"
-    return [Finding("clock", PASSED if good else FAILED, text if good else f"{text}: is the unit of values.time right?")]
+    return [DeviceCheck("clock", PASSED if good else FAILED, text if good else f"{text}: is the unit of values.time right?")]
 
 
-def _noise(taken: list[Sample], file: DeviceFile | None) -> list[Finding]:
+def _noise(taken: list[Sample], file: DeviceFile | None) -> list[DeviceCheck]:
     found = []
     for name in taken[0].values:
         values = [sample.values[name] for sample in taken]
         unit, scale = ("um", 1e3) if name in ("displacement", "radius", "x", "y", "z") else ("", 1.0)
         if not all(map(math.isfinite, values)):
-            found.append(Finding(f"noise {name}", FAILED, "a reading is not a number"))
+            found.append(DeviceCheck(f"noise {name}", FAILED, "a reading is not a number"))
             continue
         steps = sorted({abs(b - a) for a, b in pairwise(values)} - {0.0})
         step = f", smallest step {steps[0] * scale:.4g} {unit}" if steps else ""
-        found.append(Finding(f"noise {name}", PASSED, f"standard deviation {statistics.pstdev(values) * scale:.3g} {unit} at rest{step}"))
+        found.append(
+            DeviceCheck(f"noise {name}", PASSED, f"standard deviation {statistics.pstdev(values) * scale:.3g} {unit} at rest{step}")
+        )
     return found
 
 
-async def motion(probe: Probe, file: DeviceFile | None, move: Move, ask: Ask) -> list[Finding]:
+async def motion(probe: DeviceUnderTest, file: DeviceFile | None, move: Move, ask: Ask) -> list[DeviceCheck]:
     """Have the target (or each axis) moved a known way and back: sign, scale, unit, byte order."""
     found = []
     for name in probe.moved:
         try:
             found.append(await _moved(probe, file, name, move, ask))
         except DriverError as error:
-            found.append(Finding(f"motion {name}", FAILED, str(error)))
+            found.append(DeviceCheck(f"motion {name}", FAILED, str(error)))
     return found
 
 
-async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, ask: Ask) -> Finding:
+async def _moved(probe: DeviceUnderTest, file: DeviceFile | None, name: str, move: Move, ask: Ask) -> DeviceCheck:
     about, what = f"{move.mm:g} +- {move.tolerance_mm:g} mm", f"motion {name}"
     before, before_words = await _mean(probe, name), await _words(probe, name)
     done = {"displacement": f"Move the target {about} AWAY FROM the instrument.", "radius": f"Pull the bar {about} OUT."}
@@ -141,16 +145,18 @@ async def _moved(probe: Probe, file: DeviceFile | None, name: str, move: Move, a
     wrong = wrong_motion(got, move)
     if wrong:
         order = _other_order(file, name, (before_words, after_words), move)
-        return Finding(what, FAILED, order or wrong)
+        return DeviceCheck(what, FAILED, order or wrong)
     await ask("Move it back to where it was.")
     back = await _mean(probe, name) - before
     if abs(back) > move.tolerance_mm:
-        return Finding(what, FAILED, f"back at the start it reads {back:+.4f} mm: it lost counts, or slipped")
+        return DeviceCheck(what, FAILED, f"back at the start it reads {back:+.4f} mm: it lost counts, or slipped")
     share = 100.0 * move.tolerance_mm / abs(move.mm)
-    return Finding(what, PASSED, f"{move.mm:g} mm read as {got:.4f} mm and {back:+.4f} mm back: sign right, scale right to {share:.2g} %")
+    return DeviceCheck(
+        what, PASSED, f"{move.mm:g} mm read as {got:.4f} mm and {back:+.4f} mm back: sign right, scale right to {share:.2g} %"
+    )
 
 
-async def _mean(probe: Probe, name: str) -> float:
+async def _mean(probe: DeviceUnderTest, name: str) -> float:
     """Mean of some readings that began after now and a short time to settle."""
     await asyncio.sleep(SETTLED_S)
     number, values = (await probe.sample(None)).number, []
@@ -161,7 +167,7 @@ async def _mean(probe: Probe, name: str) -> float:
     return statistics.fmean(values)
 
 
-async def _words(probe: Probe, name: str) -> tuple[int, ...]:
+async def _words(probe: DeviceUnderTest, name: str) -> tuple[int, ...]:
     return (await probe.raw()).get(name, ())
 
 
@@ -204,11 +210,11 @@ def _bad(file: DeviceFile | None) -> list[str]:
     return [*found, "a reading out of range_mm"] if file.limits.range_mm is not None else found
 
 
-async def quality(probe: Probe, file: DeviceFile | None, ask: Ask) -> Finding:
+async def quality(probe: DeviceUnderTest, file: DeviceFile | None, ask: Ask) -> DeviceCheck:
     """Have the beam blocked or the plunger lifted: the reading must become invalid."""
     bad = _bad(file)
     if not bad:
-        return Finding("quality", NOT_PROVED, "the device file names nothing by which an invalid reading could be told")
+        return DeviceCheck("quality", NOT_PROVED, "the device file names nothing by which an invalid reading could be told")
     try:
         await ask("Block the beam, or lift the plunger out of its range.")
         try:
@@ -216,8 +222,8 @@ async def quality(probe: Probe, file: DeviceFile | None, ask: Ask) -> Finding:
         except DriverError as error:
             await ask("Free it again.")
             await probe.zero()
-            return Finding("quality", PASSED, f"an invalid reading is refused: {error.detail}")
+            return DeviceCheck("quality", PASSED, f"an invalid reading is refused: {error.detail}")
         await ask("Free it again.")
     except DriverError as error:
-        return Finding("quality", FAILED, f"after the beam was free again: {error}")
-    return Finding("quality", FAILED, f"a blocked or lifted sensor still reads as valid; the device file expects {', '.join(bad)}")
+        return DeviceCheck("quality", FAILED, f"after the beam was free again: {error}")
+    return DeviceCheck("quality", FAILED, f"a blocked or lifted sensor still reads as valid; the device file expects {', '.join(bad)}")

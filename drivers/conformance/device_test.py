@@ -9,12 +9,12 @@ from urllib.parse import urlsplit
 from abbe.drivers.api import DeviceInfo
 from abbe.drivers.conformance.checks import Ask, Move, identity, motion, quality, rate
 from abbe.drivers.conformance.faults import faults
-from abbe.drivers.conformance.probe import BarProbe, ControlProbe, MeterProbe, Probe, SourceProbe
+from abbe.drivers.conformance.probe import BarProbe, ControlProbe, DeviceUnderTest, MeterProbe, SourceProbe
 from abbe.drivers.conformance.proxy import Proxy
 from abbe.drivers.described.control import ListenedControl
 from abbe.drivers.described.meter import DescribedMeter
 from abbe.drivers.described.opening import Described, described, open_source
-from abbe.drivers.described.tested import Ability, Finding, TestReport, Verdict
+from abbe.drivers.described.tested import Ability, CheckVerdict, DeviceCheck, TestReport
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import BadUrl, DriverError
 from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, SocketUrl, described_by, installed, parse_url
@@ -63,23 +63,25 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
     try:
         info = await probe.identify()
         found = [*await identity(probe, file), *await rate(probe, file)]
-        if any(one.verdict is Verdict.FAILED for one in found):
+        if any(one.verdict is CheckVerdict.FAILED for one in found):
             return _report(text, about, options.role, info, found, utc)
         if options.ask is not None and options.move is not None:
             found += await motion(probe, file, options.move, options.ask)
             found += [await quality(probe, file, options.ask)] if "displacement" in probe.moved else []
         else:
-            found += [Finding(f"motion {name}", Verdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
+            found += [DeviceCheck(f"motion {name}", CheckVerdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
     finally:
         await probe.close()
     if about is not None and not isinstance(about.url, ModbusRtuUrl):
-        found.append(Finding("check sum", Verdict.NOT_PROVED, "its replies carry none: a digit that is flipped on the way cannot be seen"))
+        found.append(
+            DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry none: a digit that is flipped on the way cannot be seen")
+        )
     if options.faults:
         found += await _faults(text, about, options.role)
     return _report(text, about, options.role, info, found, utc)
 
 
-def _report(text: str, about: Described | None, role: str, info: DeviceInfo, found: list[Finding], utc: str) -> TestReport:
+def _report(text: str, about: Described | None, role: str, info: DeviceInfo, found: list[DeviceCheck], utc: str) -> TestReport:
     kind = role if about is None else about.file.kind
     return TestReport(
         text.partition("&tested=")[0], kind, info.model, info.serial_no, "" if about is None else about.sha256, utc,
@@ -87,15 +89,15 @@ def _report(text: str, about: Described | None, role: str, info: DeviceInfo, fou
     )  # fmt: skip
 
 
-def abilities(kind: str, found: tuple[Finding, ...]) -> tuple[Ability, ...]:
+def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
     """Return what a device can be used for by the findings of its test.
 
     A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was, and if no check failed.
     No test of a file proves motion or tables: that is up to a driver and `abbe comp commission`.
     """
-    if any(one.verdict is Verdict.FAILED for one in found):
+    if any(one.verdict is CheckVerdict.FAILED for one in found):
         return ()
-    passed = {one.check for one in found if one.verdict is Verdict.PASSED}
+    passed = {one.check for one in found if one.verdict is CheckVerdict.PASSED}
     needed = MOTIONS.get(kind, ())
     counts = bool(needed) and {"freshness", *needed} <= passed
     return (Ability.WATCH, Ability.DWELL) if counts else (Ability.WATCH,)
@@ -107,14 +109,14 @@ def summary(report: TestReport) -> str:
         return "it cannot be used: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:
         return "it can measure: its readings count at standstills, of an operator's NC program or of a motion that Abbe commands"
-    return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is Verdict.NOT_PROVED)
+    return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED)
 
 
-def _opener(text: str, about: Described | None, role: str) -> Callable[[], Awaitable[Probe]]:
+def _opener(text: str, about: Described | None, role: str) -> Callable[[], Awaitable[DeviceUnderTest]]:
     if about is not None:
         return lambda: _probe_of(about.url, about.file)
 
-    async def by_driver() -> Probe:
+    async def by_driver() -> DeviceUnderTest:
         if role == "laser":
             return MeterProbe(await open_laser(text))
         if role == "cnc":
@@ -126,14 +128,14 @@ def _opener(text: str, about: Described | None, role: str) -> Callable[[], Await
     return by_driver
 
 
-async def _probe_of(url: DeviceUrl, file: DeviceFile) -> Probe:
+async def _probe_of(url: DeviceUrl, file: DeviceFile) -> DeviceUnderTest:
     source = await open_source(url, file)
     if file.kind == "displacement":
         return MeterProbe(DescribedMeter(file, source))
     return ControlProbe(ListenedControl(file, source)) if file.kind == "position" else SourceProbe(file, source)
 
 
-async def _faults(text: str, about: Described | None, role: str) -> list[Finding]:
+async def _faults(text: str, about: Described | None, role: str) -> list[DeviceCheck]:
     """Test the device behind a proxy, which needs its address: a serial line, or host and port."""
     table = None if about is None else about.file.modbus or about.file.line
     proxy = Proxy(LATE_SHARE * (OWN_TIMEOUT_S if table is None else table.timeout_s))
@@ -143,7 +145,7 @@ async def _faults(text: str, about: Described | None, role: str) -> list[Finding
         if installed(text) is not None:
             parts = urlsplit(text)
             if not parts.hostname or not parts.port:
-                return [Finding("replies", Verdict.NOT_PROVED, "its URL has no host and port, so no proxy can stand before it")]
+                return [DeviceCheck("replies", CheckVerdict.NOT_PROVED, "its URL has no host and port, so no proxy can stand before it")]
             front = await proxy.front(SocketUrl(parts.hostname, parts.port))
             opener = _opener(parts._replace(netloc=f"{front.host}:{front.port}").geturl(), None, role)
         else:
@@ -154,6 +156,6 @@ async def _faults(text: str, about: Described | None, role: str) -> list[Finding
             opener = _opener(str(there), None if about is None else Described(there, about.file, about.sha256), role)
         return await faults(opener, proxy, close_mm)
     except DriverError as error:
-        return [Finding("replies", Verdict.FAILED, str(error))]
+        return [DeviceCheck("replies", CheckVerdict.FAILED, str(error))]
     finally:
         await proxy.close()

@@ -7,9 +7,9 @@ import statistics
 from collections.abc import Awaitable, Callable, Mapping
 from dataclasses import dataclass
 
-from abbe.drivers.conformance.probe import Probe, Sample
+from abbe.drivers.conformance.probe import DeviceUnderTest, Sample
 from abbe.drivers.conformance.proxy import Fault, Proxy
-from abbe.drivers.described.tested import Finding, Verdict
+from abbe.drivers.described.tested import CheckVerdict, DeviceCheck
 from abbe.drivers.errors import DriverError
 
 TRIES = 6
@@ -34,7 +34,7 @@ class _Rest:
         return {key: value for key, value in sample.values.items() if not abs(value - self.values[key]) <= self.close[key]}
 
 
-async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm: float) -> list[Finding]:
+async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy, close_mm: float) -> list[DeviceCheck]:
     """Play every fault to a device at rest.
 
     Parameters
@@ -47,26 +47,30 @@ async def faults(open_at: Callable[[], Awaitable[Probe]], proxy: Proxy, close_mm
     try:
         probe = await open_at()
     except DriverError as error:
-        return [Finding("replies", Verdict.FAILED, f"the device cannot be opened behind a proxy: {error}")]
+        return [DeviceCheck("replies", CheckVerdict.FAILED, f"the device cannot be opened behind a proxy: {error}")]
     try:
         await probe.zero()
         base = await _rest(probe, close_mm)
         found = [await _played(probe, proxy, fault, base) for fault in Fault if fault is not Fault.CUT or proxy.cuts]
-        return found if proxy.cuts else [*found, Finding(Fault.CUT.value, Verdict.NOT_PROVED, "a serial line has none: pull its plug")]
+        return (
+            found
+            if proxy.cuts
+            else [*found, DeviceCheck(Fault.CUT.value, CheckVerdict.NOT_PROVED, "a serial line has none: pull its plug")]
+        )
     except DriverError as error:
-        return [Finding("replies", Verdict.FAILED, str(error))]
+        return [DeviceCheck("replies", CheckVerdict.FAILED, str(error))]
     finally:
         await probe.close()
 
 
-async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: _Rest) -> Finding:
+async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Rest) -> DeviceCheck:
     name, before, refused, number = f"reply {fault.value}" if fault is not Fault.CUT else fault.value, proxy.done, "", base.number
     clock = asyncio.get_running_loop().time
     begun_s, good = clock(), 0
     proxy.fault = fault
     while good < TRIES or proxy.done == before:
         if clock() - begun_s > RECOVERS_S:
-            return Finding(name, Verdict.FAILED, f"no right reading within {RECOVERS_S:g} s; the last error: {refused or 'none'}")
+            return DeviceCheck(name, CheckVerdict.FAILED, f"no right reading within {RECOVERS_S:g} s; the last error: {refused or 'none'}")
         try:
             sample = await probe.sample(number)
         except DriverError as error:
@@ -75,13 +79,15 @@ async def _played(probe: Probe, proxy: Proxy, fault: Fault, base: _Rest) -> Find
             await _zeroed(probe)
             continue
         if off := base.off(sample):
-            return Finding(name, Verdict.FAILED, f"a wrong reading passed as right: {off}, at rest it was {dict(base.values)}")
+            return DeviceCheck(name, CheckVerdict.FAILED, f"a wrong reading passed as right: {off}, at rest it was {dict(base.values)}")
         number, good = sample.number, good + 1
     took = f"right again after {clock() - begun_s:.1f} s"
-    return Finding(name, Verdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right")
+    return DeviceCheck(
+        name, CheckVerdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right"
+    )
 
 
-async def _rest(probe: Probe, least: float) -> _Rest:
+async def _rest(probe: DeviceUnderTest, least: float) -> _Rest:
     taken: list[Sample] = []
     for _ in range(AT_REST):
         taken.append(await probe.sample(taken[-1].number if taken else None))
@@ -90,7 +96,7 @@ async def _rest(probe: Probe, least: float) -> _Rest:
     return _Rest(taken[-1].number, {key: statistics.fmean(values) for key, values in columns.items()}, close)
 
 
-async def _zeroed(probe: Probe) -> None:
+async def _zeroed(probe: DeviceUnderTest) -> None:
     """After a new connection a zero may be lost; a device that is still silent is asked again by the next reading."""
     try:
         await probe.zero()

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from abbe.drivers.api import BallBar, BarBatch, Controller, DeviceInfo, DisplacementMeter, bar_is_valid, bar_reasons
-from abbe.drivers.described.source import Source, physical
+from abbe.drivers.described.source import DeviceSource, physical
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import DeviceFault, DriverError
 
@@ -27,7 +27,7 @@ class Sample:
     values: Mapping[str, float]
 
 
-class Probe(Protocol):
+class DeviceUnderTest(Protocol):
     """A device under test. ``moved``: names of its values that follow a motion; ``raw``: registers of its values, if it has any."""
 
     name: str
@@ -148,7 +148,7 @@ class SourceProbe:
 
     moved: tuple[str, ...] = ()
 
-    def __init__(self, file: DeviceFile, source: Source) -> None:
+    def __init__(self, file: DeviceFile, source: DeviceSource) -> None:
         self._file, self._source = file, source
         self.name = source.name
 
@@ -172,5 +172,5 @@ class SourceProbe:
 
 async def raw_of(device: object) -> Mapping[str, tuple[int, ...]]:
     """Return the registers of a described device's values, to try other byte orders; empty for other devices."""
-    source: Source | None = getattr(device, "source", None)
+    source: DeviceSource | None = getattr(device, "source", None)
     return {} if source is None else (await source.snapshot()).words

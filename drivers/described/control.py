@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import NoReturn
 
 from abbe.drivers.api import NOTHING_HOLDS, CompStatus, Condition, ControllerStatus, DeviceInfo, Point, TableFormat
-from abbe.drivers.described.source import Snapshot, Source, meanings, physical
+from abbe.drivers.described.source import CountSnapshot, DeviceSource, meanings, physical
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import DeviceFault, NotProved, ReplyTimeout
 from abbe.drivers.links.incidents import Incidents
@@ -35,7 +35,7 @@ class ListenedControl:
 
     only_listens = True
 
-    def __init__(self, file: DeviceFile | None, source: Source | None) -> None:
+    def __init__(self, file: DeviceFile | None, source: DeviceSource | None) -> None:
         self.file, self.source = file, source
         self.name = "the control" if source is None else source.name
         self.incidents = Incidents() if source is None else source.incidents
@@ -78,7 +78,7 @@ class ListenedControl:
         if self.source is not None:
             await self.source.close()
 
-    def _check_renewed(self, snapshot: Snapshot) -> None:
+    def _check_renewed(self, snapshot: CountSnapshot) -> None:
         """Refuse positions whose counter has not changed for longer than the device may show old values."""
         count = snapshot.counts.get("counter")
         if count is None or count != self._counted[0]:

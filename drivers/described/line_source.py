@@ -11,7 +11,7 @@ import re
 from contextlib import suppress
 
 from abbe.drivers.api import DeviceInfo
-from abbe.drivers.described.source import Pace, Snapshot
+from abbe.drivers.described.source import CountSnapshot, RequestPacer
 from abbe.drivers.device_file import Command, DeviceFile
 from abbe.drivers.errors import BadFrame, DeviceFault, DriverError, LinkDown, NotProved, ReplyTimeout, WrongDevice
 from abbe.drivers.links.incidents import Incidents
@@ -147,7 +147,7 @@ class PolledLines(LineSource):
 
     def __init__(self, file: DeviceFile, link: ByteLink) -> None:
         super().__init__(file, link)
-        self._pace = Pace(file.limits.rate_hz)
+        self._pace = RequestPacer(file.limits.rate_hz)
         self._one = asyncio.Lock()
 
     async def identify(self) -> DeviceInfo:
@@ -164,7 +164,7 @@ class PolledLines(LineSource):
             await self._link.open()
             return self._info(await self._identity())
 
-    async def snapshot(self) -> Snapshot:
+    async def snapshot(self) -> CountSnapshot:
         """Ask for a reading.
 
         Raises
@@ -189,7 +189,7 @@ class PolledLines(LineSource):
                 raise
         self.incidents.good()
         self._number += 1
-        return Snapshot(host_s, self._number, counts, epoch=self._epoch)
+        return CountSnapshot(host_s, self._number, counts, epoch=self._epoch)
 
 
 class StreamedLines(LineSource):
@@ -201,7 +201,7 @@ class StreamedLines(LineSource):
             raise NotProved(self.name, "open", "questions and commands to a device that streams are not supported", "describe it as a poll")
         self._task: asyncio.Task[None] | None = None
         self._news = asyncio.Condition()
-        self._latest: Snapshot | None = None
+        self._latest: CountSnapshot | None = None
         self._given = 0
         self._trouble: DriverError | None = None
         self.left_out = 0
@@ -212,7 +212,7 @@ class StreamedLines(LineSource):
         await self.snapshot()
         return self._info("")
 
-    async def snapshot(self) -> Snapshot:
+    async def snapshot(self) -> CountSnapshot:
         """Wait for a line that was not returned before.
 
         Raises
@@ -277,7 +277,7 @@ class StreamedLines(LineSource):
             return
         async with self._news:
             self._number += 1
-            self._trouble, self._latest = None, Snapshot(host_s, self._number, counts, epoch=self._epoch)
+            self._trouble, self._latest = None, CountSnapshot(host_s, self._number, counts, epoch=self._epoch)
             self._news.notify_all()
 
     async def _tell(self, error: DriverError) -> None:

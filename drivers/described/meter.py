@@ -7,7 +7,7 @@ import math
 
 from abbe.drivers.api import DeviceInfo, LaserFlag, LaserReading
 from abbe.drivers.described.registers import TO_OURS
-from abbe.drivers.described.source import Snapshot, Source, meanings, physical
+from abbe.drivers.described.source import CountSnapshot, DeviceSource, meanings, physical
 from abbe.drivers.device_file import SIZE, Command, DeviceFile
 from abbe.drivers.errors import DeviceFault, NotProved, Rebooted, Refused, ReplyTimeout
 
@@ -36,7 +36,7 @@ class DescribedMeter:
     device file later (registers), or because it is the answer to a question of its own, or a line of its own (lines of text).
     """
 
-    def __init__(self, file: DeviceFile, source: Source) -> None:
+    def __init__(self, file: DeviceFile, source: DeviceSource) -> None:
         self.file, self.source = file, source
         self.name, self.incidents = source.name, source.incidents
         self._zero_mm: float | None = None
@@ -148,7 +148,7 @@ class DescribedMeter:
         await asyncio.sleep(self.file.limits.update_s or 0.0)
         self._not_before = self._counted(await self.source.snapshot())
 
-    async def _new(self, after: int | None) -> Snapshot:
+    async def _new(self, after: int | None) -> CountSnapshot:
         """Return a snapshot with a sample number above ``after``."""
         clock = asyncio.get_running_loop().time
         begun_s, update_s = clock(), self.file.limits.update_s
@@ -163,7 +163,7 @@ class DescribedMeter:
                 detail = f"its {what} is stuck at {snapshot.counts['counter' if what == 'counter' else 'time']:g} for {NEW_S:g} s"
                 raise ReplyTimeout(self.name, "read", f"{detail}: the device repeats an old reading", "is it measuring? restart it")
 
-    def _counted(self, snapshot: Snapshot) -> int:
+    def _counted(self, snapshot: CountSnapshot) -> int:
         """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else ours."""
         if snapshot.epoch != self._epoch:
             self._epoch, self._zero_mm = snapshot.epoch, None
@@ -188,7 +188,7 @@ class DescribedMeter:
         self._total[name] = self._total.get(name, 0.0) + step
         return step
 
-    def _reading(self, snapshot: Snapshot) -> LaserReading:
+    def _reading(self, snapshot: CountSnapshot) -> LaserReading:
         found = meanings(self.file, snapshot.counts)
         mm = physical(self.file, snapshot.counts, "displacement")
         if not math.isfinite(mm):

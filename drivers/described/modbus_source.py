@@ -8,8 +8,8 @@ from collections.abc import Iterable
 
 from abbe.drivers.api import DeviceInfo
 from abbe.drivers.described.registers import ORDERS, decode, encode, registers
-from abbe.drivers.described.source import Pace, Snapshot
-from abbe.drivers.device_file import SIZE, Command, DeviceFile, Known, Order, Value, core_values
+from abbe.drivers.described.source import CountSnapshot, RequestPacer
+from abbe.drivers.device_file import SIZE, Command, DeviceFile, DeviceValue, IdentityRegisters, Order, core_values
 from abbe.drivers.errors import Rebooted, ReplyTimeout, WrongDevice
 from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.words import next_number, run_numbered
@@ -40,7 +40,7 @@ class ModbusSource:
         assert file.modbus is not None
         self._file, self._link, self._table = file, link, file.modbus
         self.name, self.incidents = link.name, link.incidents
-        self._pace = Pace(file.limits.rate_hz)
+        self._pace = RequestPacer(file.limits.rate_hz)
         self._core = core_values(file)
         self._number = 0
         self._connection = -1
@@ -64,7 +64,7 @@ class ModbusSource:
         self.incidents.accepted()
         return DeviceInfo(self._file.kind, self._file.name, "" if serial is None else f"{serial:.0f}", int(self._boot or 0), "")
 
-    async def snapshot(self) -> Snapshot:
+    async def snapshot(self) -> CountSnapshot:
         """Read all values. After a new connection the identity is compared first: it may be another device.
 
         Raises
@@ -83,7 +83,7 @@ class ModbusSource:
             await self._same_device()
         self._number += 1
         counts = {name: decode(found, self._file.values[name].type, self._order(self._file.values[name])) for name, found in words.items()}
-        return Snapshot(arrived_s, self._number, counts, words, self._epoch)
+        return CountSnapshot(arrived_s, self._number, counts, words, self._epoch)
 
     async def command(self, command: Command, operation: str) -> None:
         """Send a command once and wait for its acknowledgement.
@@ -144,12 +144,12 @@ class ModbusSource:
                 self.incidents.note(error, latched=True)
                 raise error
 
-    async def _optional(self, value: Value | None) -> float | None:
+    async def _optional(self, value: DeviceValue | None) -> float | None:
         if value is None or value.address is None:
             return None
         return decode(await self._registers(value.address, registers(value)), value.type, self._order(value))
 
-    async def _read(self, values: dict[str, Value]) -> dict[str, tuple[int, ...]]:
+    async def _read(self, values: dict[str, DeviceValue]) -> dict[str, tuple[int, ...]]:
         first, end = span(values.values())
         words = await self._registers(first, end - first)
         at = {name: (value.address or 0) - first for name, value in values.items()}
@@ -164,17 +164,17 @@ class ModbusSource:
     async def _write(self, address: int, words: tuple[int, ...], op: ModbusOperation) -> None:
         await self._link.write(address, words, op, function=self._table.write_function)
 
-    def _order(self, value: Value) -> Order:
+    def _order(self, value: DeviceValue) -> Order:
         return value.order or self._table.order
 
 
-def span(values: Iterable[Value]) -> tuple[int, int]:
+def span(values: Iterable[DeviceValue]) -> tuple[int, int]:
     """Return the first register of some values, and the one after their last."""
     listed = [(value.address or 0, (value.address or 0) + registers(value)) for value in values]
     return min(first for first, _ in listed), max(end for _, end in listed)
 
 
-def _why(known: Known, words: tuple[int, ...], order: Order) -> tuple[str, str]:
+def _why(known: IdentityRegisters, words: tuple[int, ...], order: Order) -> tuple[str, str]:
     """Return detail and remedy for registers that hold something else than the device file says."""
     found = decode(words, known.type, order)
     fits = [other for other in ORDERS if other != order and words == encode(known.holds, known.type, other)]

@@ -11,7 +11,7 @@ from abbe.drivers.described.control import ListenedControl
 from abbe.drivers.described.line_source import PolledLines, StreamedLines
 from abbe.drivers.described.meter import DescribedMeter
 from abbe.drivers.described.modbus_source import ModbusSource, canary_of
-from abbe.drivers.described.source import Source
+from abbe.drivers.described.source import DeviceSource
 from abbe.drivers.described.tested import Ability, check_tested
 from abbe.drivers.device_file import DeviceFile, Kind, load, port_settings
 from abbe.drivers.errors import BadUrl
@@ -42,7 +42,7 @@ def described(url: DeviceUrl, kind: Kind | None = None) -> Described:
     return Described(url, file, sha256)
 
 
-async def open_source(url: DeviceUrl, file: DeviceFile) -> Source:
+async def open_source(url: DeviceUrl, file: DeviceFile) -> DeviceSource:
     """Open the wire of a described device; nothing is identified yet.
 
     Raises

@@ -5,7 +5,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 
-from abbe.drivers.device_file import SIZE, Order, Type, Unit, Value
+from abbe.drivers.device_file import SIZE, DeviceValue, Order, Type, Unit
 from abbe.drivers.links.words import bytes_of, words_of
 
 ORDERS: tuple[Order, ...] = ("ABCD", "CDAB", "BADC", "DCBA")
@@ -40,17 +40,17 @@ def encode(number: float, kind: Type, order: Order) -> tuple[int, ...]:
         raise ValueError(f"{number} is no {kind}") from None
 
 
-def scaled(value: Value, count: float) -> float:
+def scaled(value: DeviceValue, count: float) -> float:
     """Return a count in the unit of the device file."""
     return value.sign * value.scale * count + value.offset
 
 
-def ours(value: Value, count: float) -> float:
+def ours(value: DeviceValue, count: float) -> float:
     """Return a count in our unit: mm, degree C, Pa, s, % or permille."""
     factor, offset = TO_OURS[value.unit]
     return factor * scaled(value, count) + offset
 
 
-def registers(value: Value) -> int:
+def registers(value: DeviceValue) -> int:
     """Number of registers of a value."""
     return SIZE[value.type]

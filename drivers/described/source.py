@@ -14,7 +14,7 @@ from abbe.drivers.links.incidents import Incidents
 
 
 @dataclass(frozen=True, slots=True)
-class Snapshot:
+class CountSnapshot:
     """Counts of one reply or one line, by name of the value. ``number``: of the reply or line since the device was opened.
 
     ``words``: Modbus: the registers of each value, to try other byte orders. ``host_s``: monotonic host seconds of the arrival. ``epoch``:
@@ -28,14 +28,14 @@ class Snapshot:
     epoch: int = 0
 
 
-class Source(Protocol):
+class DeviceSource(Protocol):
     """The wire of a described device. Its methods raise what those of `abbe.drivers.described.modbus_source.ModbusSource` raise."""
 
     name: str
     incidents: Incidents
 
     async def identify(self) -> DeviceInfo: ...
-    async def snapshot(self) -> Snapshot: ...
+    async def snapshot(self) -> CountSnapshot: ...
     async def command(self, command: Command, operation: str) -> None: ...
     async def close(self) -> None: ...
 
@@ -57,7 +57,7 @@ def _holds(file: DeviceFile, flag: Flag, count: float) -> bool:
     return (flag.below is not None and value < flag.below) or (flag.above is not None and value > flag.above)
 
 
-class Pace:
+class RequestPacer:
     """Keeps requests at most ``rate_hz`` apart: a device may answer wrongly, or not at all, if it is asked faster."""
 
     def __init__(self, rate_hz: float) -> None:

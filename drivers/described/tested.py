@@ -27,7 +27,7 @@ class Ability(StrEnum):
     """Its readings count: at standstills of an operator's NC program, or of a motion that Abbe commands."""
 
 
-class Verdict(StrEnum):
+class CheckVerdict(StrEnum):
     """Outcome of one check."""
 
     PASSED = "passed"
@@ -37,11 +37,11 @@ class Verdict(StrEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class Finding:
+class DeviceCheck:
     """One check: its name, outcome, and a sentence with the figures."""
 
     check: str
-    verdict: Verdict
+    verdict: CheckVerdict
     text: str
 
 
@@ -57,12 +57,12 @@ class TestReport:
     device_sha256: str
     utc: str
     abilities: tuple[Ability, ...]
-    findings: tuple[Finding, ...]
+    findings: tuple[DeviceCheck, ...]
 
     @property
-    def failed(self) -> tuple[Finding, ...]:
+    def failed(self) -> tuple[DeviceCheck, ...]:
         """The checks that failed."""
-        return tuple(one for one in self.findings if one.verdict is Verdict.FAILED)
+        return tuple(one for one in self.findings if one.verdict is CheckVerdict.FAILED)
 
     def to_document(self) -> dict[str, Any]:
         """Return the report as a JSON object."""
@@ -108,5 +108,5 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
         detail = f"device {serial_no or 'without number'} answers, device {stated['serial_no'] or 'without number'} was tested"
         raise NotProved(device, f"open to {needed}", detail, remedy)
     if needed not in abilities:
-        why = "; ".join(f"{check}: {text}" for check, verdict, text in findings if verdict != Verdict.PASSED)
+        why = "; ".join(f"{check}: {text}" for check, verdict, text in findings if verdict != CheckVerdict.PASSED)
         raise NotProved(device, f"open to {needed}", f"its test did not prove it: {why}", remedy)

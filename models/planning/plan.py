@@ -15,12 +15,12 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.models.planning.measurements import DiagonalTest, HelixTest, Instruments, Measurement, candidates, expected_run, opening
 from abbe.models.planning.problem import PlanningProblem, field_rows, problem, scale_temperature_mm2, uncertainty_mm
-from abbe.models.planning.search import COVERAGE, Chosen, Goal, Search, limit, minutes_needed, shortest
+from abbe.models.planning.search import COVERAGE, Chosen, Goal, PlanSearch, limit, minutes_needed, shortest
 from abbe.models.solvers.assessment import observability
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors
 
-__all__ = ["Plan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
+__all__ = ["MeasuringPlan", "PlanStep", "laid_out", "plan_campaign", "uncertainty_mm"]
 PLAN_ORDER = 8
 """Highest Legendre order of the error motions in a plan's uncertainty; the prior of orders above 6 is small."""
 INNER_SHARE = 0.8
@@ -79,7 +79,7 @@ class PlanStep:
 
 
 @dataclass(frozen=True)
-class Plan:
+class MeasuringPlan:
     """A planned campaign.
 
     Attributes
@@ -137,7 +137,7 @@ def plan_campaign(
     priors: Priors | None = None,
     vertical: int = 2,
     progress: Callable[[float], None] = lambda _: None,
-) -> Plan:
+) -> MeasuringPlan:
     """Choose the measurements that are most informative about the deviation over the inner 80 % of the volume, in the available minutes.
 
     Parameters
@@ -159,7 +159,7 @@ def plan_campaign(
     if not 0 < minutes < np.inf or (goal_mm is not None and not 0 < goal_mm < np.inf):
         raise ValueError("planner: minutes and goal must be positive numbers")
     what = problem(machine, tools or Instruments(), PLAN_ORDER, priors)
-    search = Search(what, candidates(machine, what.tools, vertical), INNER_SHARE, progress)
+    search = PlanSearch(what, candidates(machine, what.tools, vertical), INNER_SHARE, progress)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     if goal_mm is None:
         chosen, reached = search.exchange(search.best_fill(minutes), minutes, PASSES), False
@@ -180,7 +180,7 @@ def plan_campaign(
     return replace(plan, goal=Goal(goal_mm, reached, needed, floor_mm, limit_by))
 
 
-def laid_out(search: Search, chosen: Chosen, goal_mm: float | None = None) -> Plan:
+def laid_out(search: PlanSearch, chosen: Chosen, goal_mm: float | None = None) -> MeasuringPlan:
     """Turn a choice of measurements into a plan: order them by gain per minute, label them, stop where the goal (U, mm) is reached."""
     machine, tools = search.what.machine, search.what.tools
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
@@ -193,10 +193,10 @@ def laid_out(search: Search, chosen: Chosen, goal_mm: float | None = None) -> Pl
         for s in steps
     )
     before = uncertainty_mm(np.eye(search.what.size), rows, stated)
-    return Plan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, runs))
+    return MeasuringPlan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, runs))
 
 
-def _steps(search: Search, chosen: Chosen) -> tuple[PlanStep, ...]:
+def _steps(search: PlanSearch, chosen: Chosen) -> tuple[PlanStep, ...]:
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     stated = scale_temperature_mm2(search.what, rows)
     total = np.eye(search.what.size)
@@ -213,7 +213,7 @@ def _steps(search: Search, chosen: Chosen) -> tuple[PlanStep, ...]:
     return tuple(steps)
 
 
-def _in_order(search: Search, chosen: Chosen) -> list[str]:
+def _in_order(search: PlanSearch, chosen: Chosen) -> list[str]:
     order: list[str] = []
     done: Chosen = {}
     while len(order) < len(chosen):

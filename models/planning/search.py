@@ -59,7 +59,7 @@ def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, 
 
 
 @dataclass
-class Search:
+class PlanSearch:
     """Search of one planning problem; caches the information of every mounting."""
 
     what: PlanningProblem
@@ -246,7 +246,7 @@ class Goal:
     limit_by: str
 
 
-def limit(search: Search, rows: F2) -> tuple[float, str]:
+def limit(search: PlanSearch, rows: F2) -> tuple[float, str]:
     """Return the U = 2 u (mm) that endless repetition of every candidate leaves at the worst node, and its largest contribution as text."""
     what, total = search.what, np.zeros((search.what.size, search.what.size))
     for test in search.candidates:
@@ -264,7 +264,7 @@ def limit(search: Search, rows: F2) -> tuple[float, str]:
     return COVERAGE * whole, max(shares, key=lambda name: shares[name])
 
 
-def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
+def shortest(search: PlanSearch, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
     """The shortest plan found that reaches the goal within the budget, or the best plan for the budget and False."""
     first = minutes_needed(search, rows, wanted_mm, {}, budget_min)
     if first is None:
@@ -282,7 +282,7 @@ def shortest(search: Search, rows: F2, wanted_mm: float, budget_min: float, pass
         chosen = trial
 
 
-def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, longest_min: float = LONGEST_MIN) -> float | None:
+def minutes_needed(search: PlanSearch, rows: F2, wanted_mm: float, start: Chosen, longest_min: float = LONGEST_MIN) -> float | None:
     """Minutes of a plan that extends ``start`` until it reaches the goal; None: not within ``longest_min``."""
     chosen = dict(start)
     while True:
@@ -295,5 +295,5 @@ def minutes_needed(search: Search, rows: F2, wanted_mm: float, start: Chosen, lo
             return search.total_min(chosen)
 
 
-def _enough(search: Search, rows: F2, chosen: Chosen, wanted_mm: float) -> bool:
+def _enough(search: PlanSearch, rows: F2, chosen: Chosen, wanted_mm: float) -> bool:
     return COVERAGE * uncertainty_mm(search.information(chosen), rows, scale_temperature_mm2(search.what, rows))[0] <= wanted_mm

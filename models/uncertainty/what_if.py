@@ -40,7 +40,7 @@ class ForecastFigure:
 
 
 @dataclass(frozen=True, slots=True)
-class Forecast:
+class GainForecast:
     """A figure before and after the correction, and the gain (before minus after): mean over the draws and standard uncertainty, mm."""
 
     name: str
@@ -98,7 +98,9 @@ def helix_figure(known: KnownField, centre_mm: F1, radius_mm: float, *, turns: f
     return ForecastFigure("helix_rms", "rms", left[:, None, :])
 
 
-def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED) -> list[Forecast]:
+def what_if(
+    known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure], *, draws: int = DRAWS, seed: int = SEED
+) -> list[GainForecast]:
     """Forecast figures of the machine without correction, and with a part of the estimate corrected.
 
     Parameters
@@ -117,12 +119,12 @@ def what_if(known: KnownField, taken_off: F1, figures: Sequence[ForecastFigure],
     return [_outcome(f, truth, truth - taken_off[:, None]) for f in figures]
 
 
-def _outcome(figure: ForecastFigure, before: F2, after: F2) -> Forecast:
+def _outcome(figure: ForecastFigure, before: F2, after: F2) -> GainForecast:
     first, last = _sizes(figure, before), _sizes(figure, after)
     gain = first - last
     means = [float(v.mean()) for v in (first, last, gain)]
     spreads = [float(v.std(ddof=1)) for v in (first, last, gain)]
-    return Forecast(figure.name, means[0], spreads[0], means[1], spreads[1], means[2], spreads[2])
+    return GainForecast(figure.name, means[0], spreads[0], means[1], spreads[1], means[2], spreads[2])
 
 
 def _sizes(figure: ForecastFigure, coefficients: F2) -> F1:

@@ -16,12 +16,12 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
 from abbe.models.planning.measurements import BAR_LENGTHS_MM, DiagonalTest, HelixTest, Instruments, Measurement, SetupMinutes, feed_mm_min
-from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, Plan, PlanStep, plan_campaign
+from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, MeasuringPlan, PlanStep, plan_campaign
 from abbe.models.planning.search import COVERAGE
 from abbe.service.config import read_toml
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import ConfigError, expected, location_text, nearest
-from abbe.service.rendering.document import Document, Lines, Picture, Section, TextTable
+from abbe.service.rendering.document import Document, Lines, PictureBlock, Section, TextTable
 from abbe.service.rendering.plots.views import DrawnTest, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
@@ -125,7 +125,7 @@ BOUND_NOTE = (
 class PlannedCampaign:
     """A plan with its recipes, campaign, dry run of every test, and recipe file text; ``notes``: what a person should know beforehand."""
 
-    plan: Plan
+    plan: MeasuringPlan
     recipes: tuple[Recipe, ...]
     campaign: CampaignPlan
     dry: tuple[DryRun, ...]
@@ -207,7 +207,7 @@ def describe(test: Measurement) -> str:
     return f"laser along {AXES[test.axis]}, {at} of the stroke"
 
 
-def temperature_note(plan: Plan) -> str:
+def temperature_note(plan: MeasuringPlan) -> str:
     """Describe the part of U that no measurement can reduce."""
     inputs = plan.tools.inputs
     return (
@@ -216,7 +216,7 @@ def temperature_note(plan: Plan) -> str:
     )
 
 
-def goal_lines(plan: Plan) -> list[str]:
+def goal_lines(plan: MeasuringPlan) -> list[str]:
     """Report on the goal, one sentence each; empty without a goal."""
     goal = plan.goal
     if goal is None:
@@ -233,7 +233,7 @@ def goal_lines(plan: Plan) -> list[str]:
     return [f"{here}; a working day is too short, too", bound]
 
 
-def step_rows(plan: Plan) -> list[tuple[str, ...]]:
+def step_rows(plan: MeasuringPlan) -> list[tuple[str, ...]]:
     """Return the rows of a plan: set-up, label, measurement, minutes, minutes so far, worst and mean U (k = 2) afterwards, µm."""
     before = tuple(_um(COVERAGE * u) for u in plan.u_before_mm)
     rows: list[tuple[str, ...]] = [("", "", "from the priors alone", "", "0", *before)]
@@ -252,7 +252,7 @@ def plan_report(site: Site, planned: PlannedCampaign) -> Document:
     ]
     lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_lines(plan), *planned.notes]
     headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
-    picture = Picture(
+    picture = PictureBlock(
         "Numbers: set-ups in the order of measuring. Rest the pointer on a dot to read what is set up there.",
         [setups_picture(site.machine.stroke_mm, paths)],
         "wide",

@@ -25,7 +25,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Suspending
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -67,9 +67,9 @@ class CommissioningContext:
             raise TableMismatch("the active table was changed during commissioning", "start commissioning again")
         found: list[PlaceReadings] = []
 
-        async def read() -> Verdict:
+        async def read() -> VerificationResult:
             found.append(await self.bar.read(what))
-            return Verdict(False, f"{KIND}: {what} was read")  # a test step is never kept
+            return VerificationResult(False, f"{KIND}: {what} was read")  # a test step is never kept
 
         wanted = WantedTable(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
         await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, KIND, read, read))

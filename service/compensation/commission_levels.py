@@ -40,7 +40,7 @@ FLAG = "interlocks"
 
 
 @dataclass(frozen=True, slots=True)
-class Observation:
+class FlagObservation:
     """One observation, for or against a flag of `Capabilities`."""
 
     flag: str
@@ -67,20 +67,20 @@ class Trial:
     base: Base
     owner: int
     stranger: int
-    shown: list[Observation] = field(default_factory=list)
+    shown: list[FlagObservation] = field(default_factory=list)
     boots: set[int] = field(default_factory=set)
 
     def note(self, flag: str, what: str) -> None:
         """Record an observation for a flag."""
-        self.shown.append(Observation(flag, True, what))
+        self.shown.append(FlagObservation(flag, True, what))
 
     def fail(self, flag: str, what: str) -> None:
         """Record an observation against a flag."""
-        self.shown.append(Observation(flag, False, what))
+        self.shown.append(FlagObservation(flag, False, what))
 
     def judge(self, flag: str, ok: bool, good: str, bad: str) -> None:
         """Record an observation for (``ok``) or against a flag."""
-        self.shown.append(Observation(flag, ok, good if ok else bad))
+        self.shown.append(FlagObservation(flag, ok, good if ok else bad))
 
     def expect_refusal(self, flag: str, why: str, what: str) -> None:
         """Record whether a forbidden operation was refused; ``why``: the refusal, empty if it was accepted."""
@@ -232,7 +232,7 @@ class ProvedLevels:
     """The proved capabilities of a controller. ``shown``: every observation; ``not_shown``: what this test cannot show."""
 
     capabilities: Capabilities
-    shown: tuple[Observation, ...]
+    shown: tuple[FlagObservation, ...]
     not_shown: tuple[str, ...]
     identity: Doc
     solution_id: int
@@ -290,7 +290,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     return ProvedLevels(capabilities, tuple(trial.shown), not_shown, identity(info), solution_id)
 
 
-def how(shown: tuple[Observation, ...], flag: str) -> str:
+def how(shown: tuple[FlagObservation, ...], flag: str) -> str:
     """The observations that proved a flag, or those against it."""
     of_it = [s for s in shown if s.flag == flag]
     return "; ".join(s.what for s in of_it if not s.ok) or "; ".join(s.what for s in of_it) or "not tried"

@@ -12,7 +12,7 @@ from typing import cast
 from abbe.drivers.api import Controller, OneBank, has_one_table
 from abbe.drivers.errors import Refused, run_to_end
 from abbe.service.clock import SystemClock
-from abbe.service.compensation.commission_levels import Observation, ProvedLevels, Trial, keep_proof
+from abbe.service.compensation.commission_levels import FlagObservation, ProvedLevels, Trial, keep_proof
 from abbe.service.compensation.proved_levels import flags_of, identity
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import TableMismatch, TableRefused
@@ -89,4 +89,4 @@ async def _on_again(t: Trial, control: OneBank) -> None:
     found = await read_base(t.controller)
     if found.image != t.base.image:
         raise TableMismatch("another table acts than before the test", "look at the control")
-    t.shown.append(Observation(FLAG, True, "acts with the same table afterwards"))
+    t.shown.append(FlagObservation(FLAG, True, "acts with the same table afterwards"))

@@ -32,7 +32,7 @@ from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, TableRefused, TakenBack
 from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import removed_table, subtract_table
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.push.validate import drift_reason
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Suspending
@@ -189,17 +189,17 @@ class _PushQuestions:
         now = self.precheck.renewed(self.context.store, self.context.clock.utc().timestamp())
         return [*now.reasons(self.drift_mm), *([NO_NEWER_RUN] if self.drift_mm is None else [])]
 
-    async def probe(self) -> Verdict:
+    async def probe(self) -> VerificationResult:
         """Probe sign, axis and unit of this table physically; then clear the bar away: the verification mounts its own."""
         if self.bar is None or self.read_before is None:
-            return Verdict(True, "no ball-bar is configured: the sign rests on the commissioning")
+            return VerificationResult(True, "no ball-bar is configured: the sign rests on the commissioning")
         after = await self.bar.read("after")
         await self.bar.clear_away()
         each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.precheck.base.tables, self.precheck.proposed.tables)
         found = probe(each, self.read_before.deviation_mm, after.deviation_mm)
-        return Verdict(found.agrees, found.text + ("" if all(found.observed) else "; that rests on the commissioning"))
+        return VerificationResult(found.agrees, found.text + ("" if all(found.observed) else "; that rests on the commissioning"))
 
-    async def verify(self) -> Verdict:
+    async def verify(self) -> VerificationResult:
         context = self.context
         number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns.all)) + 1
         name = f"{VERIFY}{number}"
@@ -209,7 +209,7 @@ class _PushQuestions:
         self.after = figures(await load_runs(context.store, ids))
         self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
         self.verified_as = name
-        return Verdict(self.decision.keep, self.decision.text)
+        return VerificationResult(self.decision.keep, self.decision.text)
 
 
 async def _push_and_verify(work: _PushQuestions, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:

@@ -46,7 +46,7 @@ class Drop:
     seen_by: str = ""
 
 
-class Folder:
+class ControlFolder:
     """A folder as the place where a control reads files."""
 
     def __init__(self, path: Path) -> None:
@@ -94,7 +94,7 @@ class OpcUaPlace:
             await files.close()
 
 
-Place = Folder | OpcUaPlace
+Place = ControlFolder | OpcUaPlace
 
 
 def place_at(text: str) -> Place:
@@ -105,7 +105,7 @@ def place_at(text: str) -> Place:
     FileFormatError
         There is no such folder.
     """
-    return OpcUaPlace(text) if text.startswith("opc.tcp://") else Folder(Path(text))
+    return OpcUaPlace(text) if text.startswith("opc.tcp://") else ControlFolder(Path(text))
 
 
 def place_of(source: Path) -> Path:

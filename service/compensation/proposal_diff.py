@@ -10,7 +10,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.errors import TableRefused
-from abbe.service.rendering.document import Document, Picture, Section, TextTable
+from abbe.service.rendering.document import Document, PictureBlock, Section, TextTable
 from abbe.service.rendering.plots.tables import CurveChange, change_plot
 from abbe.service.storage.store import Store
 
@@ -97,7 +97,7 @@ def diff_report(found: TableDifference, proposed: Proposed) -> Document:
         "Corrections are added to the command. Band: expanded uncertainty (k = 2) of each new entry relative to the first of its table."
     )
     sections = (
-        Section("What changes", [*lead, Picture(caption, [change_plot(found.curves)], "wide")]),
+        Section("What changes", [*lead, PictureBlock(caption, [change_plot(found.curves)], "wide")]),
         Section("The nine tables", [TextTable(HEADINGS, rows(found))]),
     )
     return Document(kind="table-change", title=title, sections=sections, signatures=())

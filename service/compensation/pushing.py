@@ -25,7 +25,7 @@ from abbe.service.errors import AbbeError, MachineInUse, PushNotBegun, StillActi
 from abbe.service.push import execute
 from abbe.service.push.execute import ControllerPort, Ended, PushActors, semantic_digest_of_tables
 from abbe.service.push.journal import Journal, OperationOrder, StoreBook, facts, push_log
-from abbe.service.push.operations import Approval, Verdict
+from abbe.service.push.operations import Approval, VerificationResult
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -82,8 +82,8 @@ class Questions:
 
     validate: Callable[[], list[str]]
     approved_by: str
-    probe: Callable[[], Awaitable[Verdict]]
-    verify: Callable[[], Awaitable[Verdict]]
+    probe: Callable[[], Awaitable[VerificationResult]]
+    verify: Callable[[], Awaitable[VerificationResult]]
     approval: Approval | None = None
 
 
@@ -118,7 +118,7 @@ class Pushing:
     crc: int | None = None
     """CRC of the pushed image, from `bring` on."""
     _stop: str = ""
-    _question: asyncio.Task[Verdict] | None = None
+    _question: asyncio.Task[VerificationResult] | None = None
     _error: BaseException | None = None
     _notes: list[str] = field(default_factory=list)
 
@@ -258,22 +258,22 @@ class Pushing:
             digest = facts(journal).binding(expiry)
             return Approval(digest, questions.approved_by, expiry, self.clock.monotonic_s() + APPROVED_S)
 
-        async def probe(journal: Journal) -> Verdict:
+        async def probe(journal: Journal) -> VerificationResult:
             return await self._run_question(questions.probe)
 
-        async def verify(journal: Journal) -> Verdict:
+        async def verify(journal: Journal) -> VerificationResult:
             return await self._run_question(questions.verify)
 
         return PushActors(validate, approve, probe, verify)
 
-    async def _run_question(self, question: Callable[[], Awaitable[Verdict]]) -> Verdict:
+    async def _run_question(self, question: Callable[[], Awaitable[VerificationResult]]) -> VerificationResult:
         """Run the job's probe or verification. An error in it fails the check; `_pushed` raises it again once the old table is in force."""
 
-        async def ask() -> Verdict:
+        async def ask() -> VerificationResult:
             return await question()
 
         if stop := self._stop_reason():  # before this question has moved anything
-            return Verdict(False, stop)
+            return VerificationResult(False, stop)
         self._question = asyncio.ensure_future(ask())
         try:
             await asyncio.wait([self._question])
@@ -285,14 +285,14 @@ class Pushing:
             task, self._question = self._question, None
         if task.cancelled():
             self._keep_notes(task)
-            return Verdict(False, "stopped")
+            return VerificationResult(False, "stopped")
         error = task.exception()
         if error is None:
             return task.result()
         self._error = error
-        return Verdict(False, str(error) or type(error).__name__)
+        return VerificationResult(False, str(error) or type(error).__name__)
 
-    def _keep_notes(self, task: asyncio.Task[Verdict]) -> None:
+    def _keep_notes(self, task: asyncio.Task[VerificationResult]) -> None:
         """Keep the notes of a stopped measurement, e.g. that the stop could not be delivered."""
         try:
             task.result()

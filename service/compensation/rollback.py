@@ -24,7 +24,7 @@ from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
 from abbe.service.push.journal import Journal, facts
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -104,8 +104,8 @@ async def rollback(
     def reasons() -> list[str]:
         return [] if wanted.image in known_images(journal) else ["UNKNOWN: the journal does not know this table as one that was in force"]
 
-    async def in_force_before() -> Verdict:
-        return Verdict(not reasons(), why)
+    async def in_force_before() -> VerificationResult:
+        return VerificationResult(not reasons(), why)
 
     by = by_whom() if request is None else request.who
     questions = Questions(reasons, f"{by}: rollback", in_force_before, in_force_before)

@@ -13,7 +13,7 @@ from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.service.compensation.correct import Correction
 from abbe.service.demo.demo import DemoResult
-from abbe.service.rendering.document import Block, Document, Lines, Picture, Section
+from abbe.service.rendering.document import Block, Document, Lines, PictureBlock, Section
 from abbe.service.rendering.model import SETUP_NOTE, ArrowField, TableCurve
 from abbe.service.rendering.numbers import COVERAGE, tidy
 from abbe.service.rendering.plots.curves import diagonal_plot
@@ -158,8 +158,8 @@ def _before_and_after(result: DemoResult, c: Correction) -> list[Block]:
         f"± is the expanded uncertainty U = k·u with k = {tidy(COVERAGE)} (about 95 %). A figure without ± has no stated uncertainty. "
         "Volumetric figures: best-fit rigid motion removed. “Sealed truth” rows come from the simulator's own error functions; the "
         "measurement never saw them.",
-        *([Picture(caption, vectors)] if vectors else []),
-        Picture(diagonals, [diagonal_plot(_curves(c.before), _curves(c.after))], "wide"),
+        *([PictureBlock(caption, vectors)] if vectors else []),
+        PictureBlock(diagonals, [diagonal_plot(_curves(c.before), _curves(c.after))], "wide"),
     ]
 
 
@@ -169,7 +169,7 @@ def _compensation(c: Correction) -> list[Block]:
         f"Correction added to the commanded position, as stored in the controller (unit {tidy(lsb_um)} µm). The controller interpolates "
         "linearly between the points."
     )
-    picture = Picture(caption, [table_plot(_tables(c.tables), lsb_um=lsb_um)], "wide")
+    picture = PictureBlock(caption, [table_plot(_tables(c.tables), lsb_um=lsb_um)], "wide")
     return [picture, SIGNS, Section("How they were written", [Lines(c.pushed.log, numbered=True)])]
 
 

@@ -35,7 +35,7 @@ from abbe.service.sequences.check import paced
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.users.people import People
+from abbe.service.users.people import UserAccounts
 from abbe.service.verification.alarms import alarms_of
 from abbe.service.verification.verify import COVERAGE, figure_rows, figures
 
@@ -53,7 +53,7 @@ MARGIN_UM = {"body_diagonal_um": 10.0, "helix_rms_um": 0.5}
 
 
 @dataclass(frozen=True, slots=True)
-class Serving:
+class ServedDemo:
     """Address of the page, user and password for the approval, log file."""
 
     page: str
@@ -144,14 +144,14 @@ def free_port(wanted: int) -> int:
 def add_approver(store: Store, clock: Clock) -> str:
     """Add a user with the right to approve; return the new password, which is stored only as a hash."""
     password = secrets.token_urlsafe(12)
-    People(store, clock).add(USER, "approver", password)
+    UserAccounts(store, clock).add(USER, "approver", password)
     return password
 
 
 @asynccontextmanager
 async def served(
     machine_file: Path, store: Store, port: int, limits_um: dict[str, float], clock: Clock | None = None
-) -> AsyncIterator[Serving]:
+) -> AsyncIterator[ServedDemo]:
     """Run the service on this machine file for the duration of the block.
 
     Raises
@@ -174,7 +174,7 @@ async def served(
         )
     try:
         await _answers(process, port, log)
-        yield Serving(f"http://127.0.0.1:{port}/", USER, password, log)
+        yield ServedDemo(f"http://127.0.0.1:{port}/", USER, password, log)
     finally:
         await run_to_end(_end(process))
 
@@ -221,7 +221,7 @@ async def drift(simulator: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -
         raise AbbeError(f"the simulated machine does not drift: {answer}", "check the scenario")
 
 
-async def narrate(simulator: SimulatorProcess, machine: str, store: Store, serving: Serving, show: Callable[[str], None]) -> None:
+async def narrate(simulator: SimulatorProcess, machine: str, store: Store, serving: ServedDemo, show: Callable[[str], None]) -> None:
     """Show one line per event until the alarm is cleared.
 
     Raises

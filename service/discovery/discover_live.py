@@ -33,7 +33,7 @@ COMPLETE = "complete"
 
 
 @dataclass(frozen=True)
-class Addition:
+class LiveAddition:
     """A measurement that continues a campaign.
 
     ``plan``: the whole plan; ``remaining``: the part that is not completely measured, None if all is; ``begun``: its stored campaign, None
@@ -57,7 +57,7 @@ def addition_count(store: Store, name: str) -> int:
     return len(chain) - 1
 
 
-def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float = 0.0) -> Addition:
+def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float = 0.0) -> LiveAddition:
     """Return what is done and what remains of a plan that continues a campaign; a campaign begun for the same plan is resumed.
 
     A set-up counts only if all its tests were completed in one mounting. After an interrupted test the equipment in the machine is unknown:
@@ -71,7 +71,7 @@ def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s:
     link = {"campaign": campaign.name, "plan": hashlib.sha256(repr(plan.tests).encode()).hexdigest()}
     begun = next((c for c in reversed(store.campaigns.all()) if c.doc.get("continues") == link), None)
     if begun is None:
-        return Addition(plan, plan, None, link, after_s)
+        return LiveAddition(plan, plan, None, link, after_s)
     runs = store.runs.all(begun.id)
     for run in runs:
         if run.visible_status == RUNNING:
@@ -80,7 +80,7 @@ def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s:
             )
     states = {run.label: run.visible_status for run in runs}
     left = _remaining(plan.tests, states)
-    return Addition(replace(plan, name=begun.name), CampaignPlan(begun.name, left) if left else None, begun, link, after_s)
+    return LiveAddition(replace(plan, name=begun.name), CampaignPlan(begun.name, left) if left else None, begun, link, after_s)
 
 
 def _remaining(tests: tuple[TestPlan, ...], states: dict[str, str]) -> tuple[TestPlan, ...]:
@@ -109,7 +109,9 @@ def _attempt(test: TestPlan, number: int) -> TestPlan:
     return replace(test, label=f"{test.label}-{number}", setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
 
 
-async def measure_added(session: Session, store: Store, site: Site, campaign: Campaign, what: Addition, progress: ProgressSink) -> float:
+async def measure_added(
+    session: Session, store: Store, site: Site, campaign: Campaign, what: LiveAddition, progress: ProgressSink
+) -> float:
     """Measure what remains of an addition to a campaign. Every completed run is stored, even if a later one fails.
 
     Returns

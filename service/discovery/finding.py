@@ -23,7 +23,7 @@ from abbe.service.domain.finding import (
     ParameterFound,
     RefittedModel,
     RivalEffect,
-    RunFit,
+    RunResidual,
     RunSeries,
     Unnamed,
 )
@@ -109,9 +109,9 @@ def _gap(gap: Gap) -> GapUm:
     return GapUm(before_um=gap.before_mm * 1e3, after_um=gap.after_mm * 1e3, floor_um=gap.floor_mm * 1e3)
 
 
-def _run(found: Discovery, run: CaseRun) -> RunFit:
+def _run(found: Discovery, run: CaseRun) -> RunResidual:
     label, measured = run.path.label, run.deviation_mm is not None
-    return RunFit(
+    return RunResidual(
         test=run.path.test,
         role=run.role,
         readings=run.path.n,

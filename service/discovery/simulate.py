@@ -14,7 +14,7 @@ from abbe.models.discovery.solved_model import left_together, predictions, solve
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discover import DiscoveryJob
 from abbe.service.discovery.finding import noise_mm_of, rms
-from abbe.service.domain.finding import Finding, GapUm, PackedReadings, RunFit, RunSeries
+from abbe.service.domain.finding import Finding, GapUm, PackedReadings, RunResidual, RunSeries
 
 FORMAT = "abbe-simulation/1"
 ROLES: tuple[Role, ...] = ("identify", "holdout")
@@ -68,11 +68,11 @@ def simulated_finding(job: DiscoveryJob, simulation: Simulation) -> Finding:
     )
 
 
-def _run(run: CaseRun, simulation: Simulation) -> RunFit:
+def _run(run: CaseRun, simulation: Simulation) -> RunResidual:
     floor_um = noise_mm_of(simulation.noise_mm, run.path.kind) * 1e3
     left = simulation.residual_mm.get(run.path.label)
     gap_um = None if left is None else rms(left) * 1e3
-    return RunFit(test=run.path.test, role=run.role, readings=run.path.n, floor_um=floor_um, rms_before_um=gap_um, rms_after_um=gap_um)
+    return RunResidual(test=run.path.test, role=run.role, readings=run.path.n, floor_um=floor_um, rms_before_um=gap_um, rms_after_um=gap_um)
 
 
 def simulation_doc(job: DiscoveryJob, simulation: Simulation) -> dict[str, Any]:

@@ -26,7 +26,7 @@ def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, P
     return matrix
 
 
-class Pose(FileObject):
+class PoseObject(FileObject):
     """Stated pose of an artefact: axis position = origin + matrix times nominal place."""
 
     origin_mm: Point
@@ -84,7 +84,7 @@ class ArtefactSetupObject(FileObject):
     artefact: Name
     source: Literal["machine-probe", "workpiece-on-cmm"]
     tool_mm: Point
-    pose: Pose
+    pose: PoseObject
     tool_radius_mm: float | None = Field(None, gt=0.0)
 
 

@@ -83,7 +83,7 @@ class GapUm:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class RunFit:
+class RunResidual:
     """One run: rms of its residuals without and with the finding, µm (None: sealed), and the noise of its instrument."""
 
     test: str
@@ -257,7 +257,7 @@ class Finding:
     p_value: float = 1.0
     noise_um: Mapping[str, float] = field(default_factory=dict)
     gaps: Mapping[str, GapUm] = field(default_factory=dict)
-    runs: Mapping[str, RunFit] = field(default_factory=dict)
+    runs: Mapping[str, RunResidual] = field(default_factory=dict)
     effects: tuple[EffectFound, ...] = ()
     suspects: tuple[EffectFound, ...] = ()
     proved: bool = False

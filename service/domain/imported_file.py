@@ -9,7 +9,7 @@ from pydantic import Field, model_validator
 from abbe.service.domain.machine import FileObject
 
 
-class Origin(FileObject):
+class SourceFile(FileObject):
     """One file that was imported.
 
     ``sha256``: of its bytes; ``said``: what it states, as text; ``unknown``: what it does not state and nobody answered.

@@ -7,7 +7,7 @@ from typing import Annotated, Literal, Self
 from pydantic import ConfigDict, Field, model_validator
 
 from abbe.service.domain.artefact import ArtefactObject
-from abbe.service.domain.imported_file import Origin, OtherReadings, StatedFigure
+from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
 from abbe.service.domain.machine import FileObject, Interval, MachineObject, Point
 
 RUN_FORMAT = "abbe-run/1"
@@ -139,7 +139,7 @@ class CampaignFile(FileObject):
     temperature_sensors: bool
     runs: list[RunEntry]
     artefacts: dict[str, ArtefactObject] = Field(default_factory=dict)
-    origins: list[Origin] = Field(default_factory=list)
+    origins: list[SourceFile] = Field(default_factory=list)
     readings: list[OtherReadings] = Field(default_factory=list)
     stated: list[StatedFigure] = Field(default_factory=list)
 
@@ -154,7 +154,7 @@ class CampaignFile(FileObject):
         return self
 
 
-class Polynomial(FileObject):
+class PolynomialObject(FileObject):
     """value(x) = sum c_k (x - origin)^k, mm or rad."""
 
     kind: Literal["polynomial"]
@@ -203,7 +203,7 @@ class Spline(FileObject):
         return self
 
 
-ErrorFunction = Annotated[Polynomial | Tabulated | LegendreSeries | Spline, Field(discriminator="kind")]
+ErrorFunction = Annotated[PolynomialObject | Tabulated | LegendreSeries | Spline, Field(discriminator="kind")]
 
 
 class Squareness(FileObject):

@@ -30,7 +30,7 @@ ANGLE_DECIMALS = 3
 
 
 @dataclass(frozen=True, slots=True)
-class _Table:
+class _CecTable:
     """One $AN_CEC table. ``curve``: numbers as in the file; ``times``: number of the table that multiplies it, from 1 (0: none);
     ``factor``: it only multiplies another table.
     """
@@ -53,26 +53,26 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
     """
     limits = LIMITS if settings.points is None else FormatLimits(points=settings.points, equidistant=True, cross=True, products=True)
     check_kinds(comp, limits, WHAT)
-    found: list[_Table] = []
+    found: list[_CecTable] = []
     for table in comp.tables:
         check_table(table, limits, WHAT, settings.reference_mm, settings.step_mm)
         for way, values in ((1, table.forward_mm), (-1, table.backward_mm)) if table.directional else ((0, table.forward_mm),):
             curve = AxisCurve(table.axis, table.position_mm, SIGN.to_file(values, table.position_mm))
-            found.append(_Table(curve, table.output, way, 0, False, settings.decimals))
+            found.append(_CecTable(curve, table.output, way, 0, False, settings.decimals))
     for p in comp.products:
         for part, limit in ((p.angle, limits), (p.lever, LEVERS)):
             check_positions(part.position_mm, limit, f"{WHAT}, {p.name}")
             check_size(part.position_mm, part.value, limit, f"{WHAT}, {p.name}")
         angle = AxisCurve(p.angle.axis, p.angle.position_mm, SIGN.to_file(p.angle.value, p.angle.position_mm))
-        found.append(_Table(angle, p.output, 0, len(found) + 2, False, settings.decimals + ANGLE_DECIMALS))
-        found.append(_Table(p.lever, p.output, 0, 0, True, settings.decimals))
+        found.append(_CecTable(angle, p.output, 0, len(found) + 2, False, settings.decimals + ANGLE_DECIMALS))
+        found.append(_CecTable(p.lever, p.output, 0, 0, True, settings.decimals))
     lines = ["%_N_NC_CEC_INI", HEAD]
     for t, table_ in enumerate(found):
         lines += _lines(t, table_, switches=bool(comp.products))
     return (TextFile(NAME, "\n".join([*lines, END]) + "\n"),)
 
 
-def _lines(t: int, table: _Table, *, switches: bool) -> list[str]:
+def _lines(t: int, table: _CecTable, *, switches: bool) -> list[str]:
     c = table.curve
     lines = [f"$AN_CEC[{t},{k}]={short(v, table.decimals)}" for k, v in enumerate(c.value)]
     lines += [
@@ -129,7 +129,7 @@ def _both(axis: str, output: str, parts: list[tuple[int, AxisCurve]]) -> AxisTab
     return AxisTable(axis, output, position, there, back)
 
 
-def _table(found: Assignments, t: int) -> _Table:
+def _table(found: Assignments, t: int) -> _CecTable:
     n = str(t)
     values = found.values("AN_CEC", n)
     step, first, last = (found.number(f"AN_CEC_{w}", n) for w in ("STEP", "MIN", "MAX"))
@@ -138,7 +138,7 @@ def _table(found: Assignments, t: int) -> _Table:
     if way not in (-1, 0, 1):
         raise found.file.wrong(found.line[("AN_CEC_DIRECTION", (n,))], f"direction {way}, expected -1, 0 or 1")
     enabled = found.value.get(("SN_CEC_TABLE_ENABLE", (n,)), "1") not in ("0", "FALSE")
-    return _Table(
+    return _CecTable(
         AxisCurve(_axis(found, "AN_CEC_INPUT_AXIS", n), position, values), _axis(found, "AN_CEC_OUTPUT_AXIS", n), way, times, not enabled, 0
     )
 

@@ -28,7 +28,7 @@ SIGN = SignRule(1, False, "by manual", True, "the program's source: skew +e for 
 
 
 @dataclass(frozen=True, slots=True)
-class Dialect:
+class SkewProgram:
     """One program: what it is called, its file, and what it can hold."""
 
     what: str
@@ -44,9 +44,9 @@ class Dialect:
         )
 
 
-MARLIN = Dialect("Marlin", "abbe-marlin.gcode", True, True)
-KLIPPER = Dialect("Klipper", "abbe-klipper.gcode", True, False)
-GRBLHAL = Dialect("grblHAL", "abbe-grblhal.txt", False, True)
+MARLIN = SkewProgram("Marlin", "abbe-marlin.gcode", True, True)
+KLIPPER = SkewProgram("Klipper", "abbe-klipper.gcode", True, False)
+GRBLHAL = SkewProgram("grblHAL", "abbe-grblhal.txt", False, True)
 
 
 def factor_of(ac: float, bd: float, ad: float) -> float:
@@ -61,7 +61,7 @@ def lengths_of(factor: float) -> tuple[float, float, float]:
     return SIDE_MM * math.sqrt(2.0 + 2.0 * cosine), SIDE_MM * math.sqrt(2.0 - 2.0 * cosine), SIDE_MM
 
 
-def write(comp: Compensation, settings: FormatSettings, *, dialect: Dialect) -> tuple[TextFile, ...]:
+def write(comp: Compensation, settings: FormatSettings, *, dialect: SkewProgram) -> tuple[TextFile, ...]:
     """Write the commands in one file, with those that take them back.
 
     Raises
@@ -79,7 +79,7 @@ def write(comp: Compensation, settings: FormatSettings, *, dialect: Dialect) -> 
     return (TextFile(dialect.name, "\n".join(lines) + "\n"),)
 
 
-def _factors(comp: Compensation, dialect: Dialect) -> tuple[float, float, float]:
+def _factors(comp: Compensation, dialect: SkewProgram) -> tuple[float, float, float]:
     """Return xy, xz and yz of the programs' formula."""
     slope = dict.fromkeys(PAIRS, 0.0)
     for t in comp.tables:
@@ -116,7 +116,7 @@ def _grblhal(_: tuple[float, float, float], lost: dict[str, str]) -> list[str]:
 _COMMANDS = {MARLIN.what: _marlin, KLIPPER.what: _klipper, GRBLHAL.what: _grblhal}
 
 
-def read(files: tuple[TextFile, ...], settings: FormatSettings, *, dialect: Dialect) -> Compensation:
+def read(files: tuple[TextFile, ...], settings: FormatSettings, *, dialect: SkewProgram) -> Compensation:
     """Read the commands as the program does; lines are zero at the reference.
 
     Raises

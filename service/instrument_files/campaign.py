@@ -11,14 +11,14 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.domain.document import Doc
-from abbe.service.domain.imported_file import Origin
+from abbe.service.domain.imported_file import SourceFile
 from abbe.service.domain.run import PLACES, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT, CampaignFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.answers import LENGTHS, Answers, laser_of, settled, unknown_of
 from abbe.service.instrument_files.content import AxisReadings, Content, Trace
 from abbe.service.runs.checks import check, check_run
-from abbe.service.runs.exchange import Folder
+from abbe.service.runs.exchange import FolderContent
 
 NEAREST_MM = 0.1
 """Least distance of two targets: evaluations round positions to 0.05 mm."""
@@ -33,8 +33,8 @@ MOST_SAMPLES = 100_000
 class Made:
     """A campaign made of files, checked like a folder; ``origins``: of each file, in order."""
 
-    folder: Folder
-    origins: tuple[Origin, ...]
+    folder: FolderContent
+    origins: tuple[SourceFile, ...]
 
 
 def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machine: Doc | None) -> Made:
@@ -85,7 +85,7 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     for run in runs:
         check_run(Path(f"{run['run_id']}.json"), run)
     check(Path("campaign.json"), document, CampaignFile)
-    return Made(Folder(document, runs, [Run.from_document(run) for run in runs], None, {}), tuple(origins))
+    return Made(FolderContent(document, runs, [Run.from_document(run) for run in runs], None, {}), tuple(origins))
 
 
 def _check_together(contents: Sequence[Content]) -> None:
@@ -160,13 +160,13 @@ def _run(campaign: str, number: int, machine: Doc, axis: str, columns: Mapping[s
     return head | {"machine": machine, "setup": setup, "columns": plain}
 
 
-def _origin(content: Content, test: AxisReadings | None, machine: Doc | None) -> Origin:
+def _origin(content: Content, test: AxisReadings | None, machine: Doc | None) -> SourceFile:
     unknown = [] if test is None else unknown_of(test)
     if machine is None:
         unknown.append(
             f"chain and strokes of the machine: {ASSUMED_CHAIN} and the measured length are assumed (--machine FILE states them)"
         )
-    return Origin(file=content.name, format=content.form, sha256=content.sha256, said=dict(content.said), unknown=unknown)
+    return SourceFile(file=content.name, format=content.form, sha256=content.sha256, said=dict(content.said), unknown=unknown)
 
 
 def _beside(contents: Sequence[Content], tests: Sequence[AxisReadings | None]) -> Doc:

@@ -31,20 +31,20 @@ MOST_ROWS = 200_000
 Column = Annotated[str | int, Field(description="heading of the column, or its number from 1")]
 
 
-class Part(BaseModel):
+class ColumnFilePart(BaseModel):
     """Base of the objects of a column file: unknown keys are mistakes."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
 
-class Measured(Part):
+class MeasuredColumn(ColumnFilePart):
     """One column with a unit."""
 
     column: Column
     unit: str
 
 
-class Direction(Part):
+class Direction(ColumnFilePart):
     """The column that says from where a target was approached, and its words for + and - of the axis."""
 
     column: Column
@@ -63,7 +63,7 @@ def toml_of(columns: ColumnFile) -> str:
     return "\n".join(lines) + "\n"
 
 
-class ColumnFile(Part):
+class ColumnFile(ColumnFilePart):
     """What the columns of a table are (``abbe-columns/1``, TOML).
 
     ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. Without ``target`` the axis stood at
@@ -73,17 +73,17 @@ class ColumnFile(Part):
 
     format: Literal["abbe-columns/1"] = "abbe-columns/1"
     axis: Literal["X", "Y", "Z"]
-    target: Measured | None = None
+    target: MeasuredColumn | None = None
     at_mm: float | None = None
-    measured: Measured | None = None
-    deviation: Measured | None = None
+    measured: MeasuredColumn | None = None
+    deviation: MeasuredColumn | None = None
     direction: Direction | None = None
-    time: Measured | None = None
+    time: MeasuredColumn | None = None
     every_s: float | None = Field(default=None, gt=0.0)
-    scale_temperature: Measured | None = None
-    spindle_temperature: Measured | None = None
-    air_temperature: Measured | None = None
-    air_pressure: Measured | None = None
+    scale_temperature: MeasuredColumn | None = None
+    spindle_temperature: MeasuredColumn | None = None
+    air_temperature: MeasuredColumn | None = None
+    air_pressure: MeasuredColumn | None = None
     heading: int = Field(default=1, ge=0, le=1000)
     delimiter: Literal[",", ";", "tab", "blank"] | None = None
     decimal: Literal[".", ","] = "."
@@ -115,7 +115,7 @@ _UNITS: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True)
-class Rows:
+class FileRows:
     """A table: each row with its number in the file, and its cells as text."""
 
     file: TextFile
@@ -149,7 +149,7 @@ def column_file(path: Path) -> ColumnFile:
         raise FileFormatError(f"{path}: {f'{place}: ' if place else ''}{expected(first)}", "see docs/how-to/import.md") from None
 
 
-def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> Rows:
+def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> FileRows:
     """Cells of a CSV, TSV or XLSX. The row ``heading`` shows how a text file is divided, if ``delimiter`` does not say it.
 
     Raises
@@ -172,7 +172,7 @@ def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None,
             raise file.wrong(line, f"more than {MOST_ROWS} rows")
     if not rows:
         raise file.wrong(1, "the table is empty")
-    return Rows(file, rows)
+    return FileRows(file, rows)
 
 
 def _delimiter(file: TextFile, heading: int, delimiter: str | None) -> str:
@@ -182,7 +182,7 @@ def _delimiter(file: TextFile, heading: int, delimiter: str | None) -> str:
     return next((sign for sign in ("\t", ";", ",") if sign in first), " ")
 
 
-def _excel(name: str, data: bytes, sheet: str | None) -> Rows:
+def _excel(name: str, data: bytes, sheet: str | None) -> FileRows:
     try:
         from python_calamine import CalamineError, CalamineWorkbook
     except ModuleNotFoundError:
@@ -202,7 +202,7 @@ def _excel(name: str, data: bytes, sheet: str | None) -> Rows:
     rows = [(line, row) for line, row in rows if any(row)]
     if not rows or len(rows) > MOST_ROWS:
         raise file.wrong(1, f"the sheet has {len(rows)} rows, expected 1 to {MOST_ROWS}")
-    return Rows(file, rows)
+    return FileRows(file, rows)
 
 
 def _text(cell: Any) -> str:
@@ -210,10 +210,10 @@ def _text(cell: Any) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class _Body:
+class _ReadingRows:
     """The rows of readings of a table, its headings, and what its columns are."""
 
-    table: Rows
+    table: FileRows
     columns: ColumnFile
     headings: list[str]
     rows: list[tuple[int, list[str]]]
@@ -263,7 +263,7 @@ def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
     """
     table = table_of(name, data, columns.heading, columns.delimiter, columns.sheet)
     headings = table.headings(columns.heading)
-    body = _Body(table, columns, headings, [(line, cells) for line, cells in table.rows if line > columns.heading])
+    body = _ReadingRows(table, columns, headings, [(line, cells) for line, cells in table.rows if line > columns.heading])
     if len(body.rows) < 2:
         raise table.file.wrong(table.rows[-1][0], f"{len(body.rows)} rows of readings, expected two or more")
     for row, (_, cells) in enumerate(body.rows):
@@ -291,7 +291,7 @@ def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
     )
 
 
-def _places(body: _Body) -> tuple[F1, F1, str]:
+def _places(body: _ReadingRows) -> tuple[F1, F1, str]:
     """Position and direction of each reading, and a note on where they come from."""
     columns, n = body.columns, len(body.rows)
     if columns.target is None:
@@ -303,7 +303,7 @@ def _places(body: _Body) -> tuple[F1, F1, str]:
     return target, _by_words(body, columns.direction), ""
 
 
-def _deviations(body: _Body, position: F1) -> tuple[F1, float, str]:
+def _deviations(body: _ReadingRows, position: F1) -> tuple[F1, float, str]:
     """Deviations in mm or rad, their step, and the quantity."""
     name, one = ("deviation", body.columns.deviation) if body.columns.deviation is not None else ("measured", body.columns.measured)
     assert one is not None
@@ -317,7 +317,7 @@ def _deviations(body: _Body, position: F1) -> tuple[F1, float, str]:
     return value, step_of(words, unit), "angle" if one.unit in ANGLES else "length"
 
 
-def _by_words(body: _Body, direction: Direction) -> F1:
+def _by_words(body: _ReadingRows, direction: Direction) -> F1:
     k, words = body.index(direction.column), {direction.plus: 1.0, direction.minus: -1.0}
     for row, (_, cells) in enumerate(body.rows):
         if len(cells) <= k or cells[k].strip() not in words:
@@ -326,7 +326,7 @@ def _by_words(body: _Body, direction: Direction) -> F1:
     return np.array([words[cells[k].strip()] for _, cells in body.rows])
 
 
-def _by_order(body: _Body, target: F1) -> F1:
+def _by_order(body: _ReadingRows, target: F1) -> F1:
     step = np.sign(np.diff(target))
     for k in range(1, step.size):
         if step[k] == 0.0 == step[k - 1]:
@@ -341,7 +341,7 @@ def _by_order(body: _Body, target: F1) -> F1:
     return way
 
 
-def _times(body: _Body) -> F1 | None:
+def _times(body: _ReadingRows) -> F1 | None:
     if body.columns.time is None:
         every = body.columns.every_s
         return None if every is None else every * np.arange(len(body.rows), dtype=np.float64)
@@ -352,7 +352,7 @@ def _times(body: _Body) -> F1 | None:
     return t
 
 
-def _further(body: _Body) -> dict[str, F1]:
+def _further(body: _ReadingRows) -> dict[str, F1]:
     names = {
         "scale_temperature": f"temp_{body.columns.axis.lower()}_C",
         "spindle_temperature": "temp_spindle_C",
@@ -361,7 +361,7 @@ def _further(body: _Body) -> dict[str, F1]:
     }
     out = {}
     for name, column in names.items():
-        one: Measured | None = getattr(body.columns, name)
+        one: MeasuredColumn | None = getattr(body.columns, name)
         if one is not None:
             values = body.numbers(name)[0]
             values = values + TEMPERATURES[one.unit] if one.unit in TEMPERATURES else values * PRESSURES[one.unit]

@@ -26,7 +26,7 @@ from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.campaign import ASSUMED_CHAIN
 from abbe.service.instrument_files.content import read_bytes, text_file
 from abbe.service.runs.checks import check, check_run
-from abbe.service.runs.exchange import Folder
+from abbe.service.runs.exchange import FolderContent
 
 HEAD = (
     "artefact", "kind", "source", "tool_mm", "origin_mm", "rotation_deg", "expansion_per_K", "u_expansion_per_K", "temperature_C",
@@ -70,7 +70,7 @@ def is_point_list(path: Path) -> bool:
     return bool(PLATE.match(start)) or bool(rows and {"feature", *NOMINAL[:2]} <= set(rows[0].replace(" ", "").split(",")))
 
 
-def campaign_of_points(paths: Sequence[Path], name: str, machine: Doc | None) -> Folder:
+def campaign_of_points(paths: Sequence[Path], name: str, machine: Doc | None) -> FolderContent:
     """Make one campaign of lists of points of one machine; without ``machine`` chain and strokes are assumed.
 
     Raises
@@ -101,7 +101,7 @@ def campaign_of_points(paths: Sequence[Path], name: str, machine: Doc | None) ->
     for run in runs:
         check_run(Path(f"{run['run_id']}.json"), run)
     check(Path("campaign.json"), document, CampaignFile)
-    return Folder(document, runs, [Run.from_document(run).with_artefact(document) for run in runs], None, {})
+    return FolderContent(document, runs, [Run.from_document(run).with_artefact(document) for run in runs], None, {})
 
 
 def _read(file: TextFile) -> PointList:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from abbe.service.domain.imported_file import Origin
+from abbe.service.domain.imported_file import SourceFile
 from abbe.service.instrument_files.content import AxisReadings, Content
 from abbe.service.rendering.numbers import plain
 
@@ -12,7 +12,7 @@ UM = 1e3
 URAD = 1e6
 
 
-def preview_rows(content: Content, test: AxisReadings | None, origin: Origin) -> list[tuple[str, str]]:
+def preview_rows(content: Content, test: AxisReadings | None, origin: SourceFile) -> list[tuple[str, str]]:
     """Names and values of one file: what it is, what it states, its readings, what was not read and what is unknown."""
     out = [("file", content.name), ("format", content.form), ("machine", content.machine or "not stated")]
     if test is not None:

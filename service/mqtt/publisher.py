@@ -48,7 +48,7 @@ class OutboxRow(Protocol):
         ...
 
 
-class Outbox(Protocol):
+class MessageSource(Protocol):
     """Source of the publisher's messages."""
 
     async def pending(self) -> Sequence[OutboxRow]:
@@ -178,7 +178,7 @@ class Publisher:
         self,
         broker: Broker,
         topics: Topics,
-        outbox: Outbox,
+        outbox: MessageSource,
         clock: Clock,
         on_change: Callable[[bool], None] = lambda connected: None,
         on_drop: Callable[[int], None] = lambda dropped: None,

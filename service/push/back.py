@@ -15,10 +15,10 @@ from abbe.service.push.operations import (
     Coherent,
     Failed,
     Image,
-    Knowledge,
     Operation,
     OperationKind,
-    Refused,
+    OperationRefused,
+    PushKnowledge,
     Truth,
     bracket,
     stage,
@@ -53,7 +53,7 @@ def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
     return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": reported}
 
 
-def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
+def go_back(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> Operation:
     """Next operation of a rollback.
 
     ``state``: that of the last entry, namely ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry;
@@ -75,7 +75,7 @@ def go_back(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Opera
     return _switch(f, known, state, seq)
 
 
-def _arrived(f: PushFacts, known: Knowledge) -> Operation:
+def _arrived(f: PushFacts, known: PushKnowledge) -> Operation:
     assert known.start is not None
     step = bracket(known, known.start.active, len(f.base_image) // 2, again=False)
     if isinstance(step, Operation):
@@ -87,7 +87,7 @@ def _arrived(f: PushFacts, known: Knowledge) -> Operation:
     return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **mismatch_doc(f, known.start))
 
 
-def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Operation:
+def _switch(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> Operation:
     """The new table is active, or an exchange was interrupted and none acts: bring the old one back."""
     truth = known.start
     assert truth is not None
@@ -96,7 +96,7 @@ def _switch(f: PushFacts, known: Knowledge, state: PushState, seq: int) -> Opera
     if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f.base_crc:
         return _pending(state, "the old table acts after the control's next start: restart it, and move nothing before")
     if state is PushState.ACTIVATING_BACK:
-        text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation of the old table did not happen"
+        text = known.verdict.text if isinstance(known.verdict, OperationRefused) else "the activation of the old table did not happen"
         return _pending(state, text) if known.backs >= BACKS else record(PushState.ROLLBACK, again=text)
     if state is PushState.ROLLBACK_PENDING:
         return (
@@ -115,8 +115,8 @@ def _lease_open(f: PushFacts, truth: Truth) -> bool:
     return truth.owner == 0 or f.owner <= truth.owner <= f.owner + OWNERS
 
 
-def _lease(f: PushFacts, known: Knowledge, truth: Truth, state: PushState, seq: int) -> Operation:
-    if isinstance(known.verdict, Refused) or not _lease_open(f, truth):
+def _lease(f: PushFacts, known: PushKnowledge, truth: Truth, state: PushState, seq: int) -> Operation:
+    if isinstance(known.verdict, OperationRefused) or not _lease_open(f, truth):
         return _pending(state, "another owner has the lease")
     if known.leases + known.releases >= LEASES:
         return _pending(state, "the controller answers, but does not give or take the lease")
@@ -125,7 +125,7 @@ def _lease(f: PushFacts, known: Knowledge, truth: Truth, state: PushState, seq: 
     return Operation(OperationKind.LEASE, owner=f.owner + 1 + seq)
 
 
-def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+def _with_old_bank(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
     """Activate the old table from its bank, or restore it from the journal if the controller lost it; never overwrite foreign content."""
     other, base = 1 - truth.active, f.base_image
     if truth.states[other] is BankState.SEALED and truth.crc[other] == f.base_crc:
@@ -153,7 +153,7 @@ def _with_old_bank(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
     )
 
 
-def _with_table_off(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+def _with_table_off(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
     """A control with one table was interrupted while tables were exchanged: restore the old one, unless its table holds foreign content."""
     step = bracket(known, truth.active, min(len(f.image), len(f.base_image)) // 2, again=False)
     if isinstance(step, Operation):
@@ -189,7 +189,7 @@ def _ours(content: bytes, base: bytes, size: int) -> bool:
     return len(content) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 
 
-def _restage(f: PushFacts, known: Knowledge, truth: Truth, state: PushState) -> Operation:
+def _restage(f: PushFacts, known: PushKnowledge, truth: Truth, state: PushState) -> Operation:
     if not known.wrote_last:  # the progress of an earlier process is unknown: restart with the present generation
         return record(PushState.ROLLBACK, again="restoring the old table was interrupted")
     image = Image(

@@ -22,7 +22,7 @@ from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.push import operations as o
 from abbe.service.push.journal import Journal, OperationOrder, facts
 from abbe.service.push.machine import next_operation
-from abbe.service.push.operations import Knowledge, Operation, OperationKind, Outcome, Truth, after_record, learn
+from abbe.service.push.operations import Operation, OperationKind, Outcome, PushKnowledge, Truth, after_record, learn
 from abbe.service.sequences.control import tripped
 
 LEASE_MS, BEAT_S = 60_000, 20.0
@@ -76,16 +76,16 @@ async def push(port: Port, book: Book, order: OperationOrder, *, stop: Callable[
 
     ``stop`` is called before every operation: a reason to stop, or an empty text. A stop rolls an unverified table back.
     """
-    return await _drive(port, book, (), Knowledge(mine=True), order, stop)
+    return await _drive(port, book, (), PushKnowledge(mine=True), order, stop)
 
 
 async def recover(port: Port, book: Book) -> Ended:
     """Finish an interrupted push from its journal and the controller's state. May itself be interrupted and repeated."""
-    return await _drive(port, book, await book.entries(), Knowledge(), None, _never_stop)
+    return await _drive(port, book, await book.entries(), PushKnowledge(), None, _never_stop)
 
 
 async def _drive(
-    port: Port, book: Book, journal: Journal, known: Knowledge, order: OperationOrder | None, stop: Callable[[], str]
+    port: Port, book: Book, journal: Journal, known: PushKnowledge, order: OperationOrder | None, stop: Callable[[], str]
 ) -> Ended:
     while True:
         text = stop()
@@ -108,8 +108,8 @@ class PushActors:
 
     validate: Callable[[Journal], Awaitable[list[str]]]
     approve: Callable[[Journal], Awaitable[o.Approval | None]]
-    probe: Callable[[Journal], Awaitable[o.Verdict]]
-    verify: Callable[[Journal], Awaitable[o.Verdict]]
+    probe: Callable[[Journal], Awaitable[o.VerificationResult]]
+    verify: Callable[[Journal], Awaitable[o.VerificationResult]]
 
 
 def no_actors() -> PushActors:
@@ -121,8 +121,8 @@ def no_actors() -> PushActors:
     async def no_approval(journal: Journal) -> o.Approval | None:
         return None
 
-    async def no_verdict(journal: Journal) -> o.Verdict:
-        return o.Verdict(False, "no one is present to measure it")
+    async def no_verdict(journal: Journal) -> o.VerificationResult:
+        return o.VerificationResult(False, "no one is present to measure it")
 
     return PushActors(no_reason, no_approval, no_verdict, no_verdict)
 
@@ -147,7 +147,7 @@ class ControllerPort:
         try:
             return await self._execute(op, journal)
         except Refused as error:
-            return o.Refused(str(error))
+            return o.OperationRefused(str(error))
         except (DriverError, TimeoutError) as error:
             return o.Doubt(str(error) or type(error).__name__)
 
@@ -187,10 +187,10 @@ class ControllerPort:
             return o.Done(await self._actors.validate(journal))
         if kind is OperationKind.APPROVE:
             approval = await self._actors.approve(journal)
-            return o.Refused("it was not approved") if approval is None else o.Done(approval)
+            return o.OperationRefused("it was not approved") if approval is None else o.Done(approval)
         return o.Done(await self._while_leased(self._actors.probe if kind is OperationKind.PROBE else self._actors.verify, journal))
 
-    async def _while_leased(self, question: Callable[[Journal], Awaitable[o.Verdict]], journal: Journal) -> o.Verdict:
+    async def _while_leased(self, question: Callable[[Journal], Awaitable[o.VerificationResult]], journal: Journal) -> o.VerificationResult:
         """Measure while renewing the lease. If another owner takes it, the measurement does not count."""
         over, lost = asyncio.Event(), asyncio.Event()
         asked = asyncio.ensure_future(question(journal))
@@ -204,7 +204,7 @@ class ControllerPort:
             over.set()  # not cancelled: a command under way would leave the link in doubt
             await asyncio.wait([beat])
         if lost.is_set() and asked.cancelled():
-            return o.Verdict(False, "another owner took the lease meanwhile")
+            return o.VerificationResult(False, "another owner took the lease meanwhile")
         if not beat.cancelled():
             beat.exception()  # a failed renewal shows at the next look at the lease; the measurement counts
         return asked.result()

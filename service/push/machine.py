@@ -22,12 +22,12 @@ from abbe.service.push.operations import (
     Done,
     Failed,
     Image,
-    Knowledge,
     Operation,
     OperationKind,
-    Refused,
+    OperationRefused,
+    PushKnowledge,
     Truth,
-    Verdict,
+    VerificationResult,
     bracket,
     stage,
 )
@@ -38,7 +38,7 @@ LEASE_LEFT_MS = 5000
 """With less than this left, the lease may end between the last look and the activation."""
 
 
-def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | None = None) -> Operation:
+def next_operation(journal: Journal, known: PushKnowledge, order: OperationOrder | None = None) -> Operation:
     """Decide what to do next.
 
     ``journal``: all entries of one push, empty before the first; ``known``: everything that this process has learned since its start or
@@ -59,7 +59,7 @@ def next_operation(journal: Journal, known: Knowledge, order: OperationOrder | N
     return _AFTER[state](f, known)
 
 
-def _leave(f: PushFacts, known: Knowledge) -> Operation:
+def _leave(f: PushFacts, known: PushKnowledge) -> Operation:
     """The push has ended: release its lease, also one left by a process that died after the last entry."""
     if known.unanswered >= MAX_UNANSWERED or known.fenced:
         return Operation(OperationKind.END)
@@ -76,7 +76,7 @@ def _leave(f: PushFacts, known: Knowledge) -> Operation:
     )
 
 
-def _begin(known: Knowledge, order: OperationOrder) -> Operation:
+def _begin(known: PushKnowledge, order: OperationOrder) -> Operation:
     """Read the table in force twice, with a look at the controller's state before and after; then record the snapshot."""
     if known.stop or known.unanswered >= MAX_UNANSWERED:
         return Operation(OperationKind.END, text=known.stop or "the controller does not answer")
@@ -95,14 +95,14 @@ def _begin(known: Knowledge, order: OperationOrder) -> Operation:
     return record(PushState.SNAPSHOT, **base, **order.doc())
 
 
-def _abandon(f: PushFacts, known: Knowledge, state: PushState, why: str) -> Operation:
+def _abandon(f: PushFacts, known: PushKnowledge, state: PushState, why: str) -> Operation:
     """Give up before activation: release the lease and end. The table in force was never touched."""
     if state not in (PushState.SNAPSHOT, PushState.VALIDATED) and not known.fenced and known.unanswered < 2 * MAX_UNANSWERED:
         return Operation(OperationKind.RELEASE, owner=f.owner, text=why)
     return record(PushState.ABORTED, why=why)
 
 
-def _validate(f: PushFacts, known: Knowledge) -> Operation:
+def _validate(f: PushFacts, known: PushKnowledge) -> Operation:
     no = objection(f.level, attended=f.attended)
     if no:
         return record(PushState.REJECTED, reasons=[no])
@@ -114,7 +114,7 @@ def _validate(f: PushFacts, known: Knowledge) -> Operation:
     return record(PushState.REJECTED, reasons=[known.verdict.text])
 
 
-def _approve(f: PushFacts, known: Knowledge) -> Operation:
+def _approve(f: PushFacts, known: PushKnowledge) -> Operation:
     if known.verdict is None:
         return Operation(OperationKind.APPROVE)
     if not isinstance(known.verdict, Done) or not isinstance(known.verdict.value, Approval):
@@ -126,10 +126,10 @@ def _approve(f: PushFacts, known: Knowledge) -> Operation:
     return record(PushState.APPROVED, approval=approval.digest, approved_by=approval.by, expiry=approval.expiry)
 
 
-def _lease(f: PushFacts, known: Knowledge) -> Operation:
+def _lease(f: PushFacts, known: PushKnowledge) -> Operation:
     if known.verdict is None:
         return Operation(OperationKind.LEASE, owner=f.owner)
-    if isinstance(known.verdict, Refused):
+    if isinstance(known.verdict, OperationRefused):
         return _abandon(f, known, PushState.APPROVED, f"another owner has the lease: {known.verdict.text}")
     if isinstance(known.verdict, Done):
         return record(PushState.LEASED)
@@ -140,7 +140,7 @@ def _lease(f: PushFacts, known: Knowledge) -> Operation:
     return _abandon(f, known, PushState.APPROVED, "the lease could not be taken")
 
 
-def _precheck(f: PushFacts, known: Knowledge) -> Operation:
+def _precheck(f: PushFacts, known: PushKnowledge) -> Operation:
     truth = known.truth
     if truth is None:
         return Operation(OperationKind.LOOK)
@@ -152,7 +152,7 @@ def _precheck(f: PushFacts, known: Knowledge) -> Operation:
     return record(PushState.STAGING, still_s=truth.still_s)
 
 
-def _stage(f: PushFacts, known: Knowledge) -> Operation:
+def _stage(f: PushFacts, known: PushKnowledge) -> Operation:
     image = Image(f.target, f.image, f.crc, f.semantic_digest, f.owner, f.gen, f.boot, f.base_crc, f.chunk_words)
     step = stage(image, known)
     if isinstance(step, Coherent):
@@ -160,7 +160,7 @@ def _stage(f: PushFacts, known: Knowledge) -> Operation:
     return _abandon(f, known, PushState.STAGING, step.why) if isinstance(step, Failed) else step
 
 
-def _arm(f: PushFacts, known: Knowledge) -> Operation:
+def _arm(f: PushFacts, known: PushKnowledge) -> Operation:
     """The last look before the activation: check everything again."""
     truth = known.truth
     if truth is None:
@@ -192,7 +192,7 @@ def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
     return f"not safe now: {truth.unsafe}" if truth.unsafe else ""
 
 
-def _activate(f: PushFacts, known: Knowledge) -> Operation:
+def _activate(f: PushFacts, known: PushKnowledge) -> Operation:
     """Send the activation once, never again; read its result from the controller."""
     if known.mine and known.wrote_last and not known.asked and not known.stop:
         return Operation(OperationKind.ACTIVATE, bank=f.target, crc=f.expect_crc, gen=f.expect_gen, owner=f.owner)
@@ -203,7 +203,7 @@ def _activate(f: PushFacts, known: Knowledge) -> Operation:
     return _unconfirmed(f, known)
 
 
-def _confirm(f: PushFacts, known: Knowledge) -> Operation | None:
+def _confirm(f: PushFacts, known: PushKnowledge) -> Operation | None:
     """Confirm that the new table is active and byte for byte the approved one. None: it is not, or this cannot be shown."""
     if known.unanswered >= MAX_UNANSWERED:
         return None
@@ -217,7 +217,7 @@ def _confirm(f: PushFacts, known: Knowledge) -> Operation | None:
     return Operation(OperationKind.LOOK, mark=True) if known.brackets < BRACKETS else None
 
 
-def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
+def _unconfirmed(f: PushFacts, known: PushKnowledge) -> Operation:
     """Shut out a command that may still be under way, then look which table is in force."""
     if known.unanswered >= 2 * MAX_UNANSWERED:
         return Operation(OperationKind.END, text="the controller does not answer: whether the new table is active is not known")
@@ -228,24 +228,24 @@ def _unconfirmed(f: PushFacts, known: Knowledge) -> Operation:
     which = in_force(f, known.truth)
     if which == "base":
         return _not_in_force(f, known, known.truth)
-    if which == "off" and isinstance(known.verdict, Refused):
+    if which == "off" and isinstance(known.verdict, OperationRefused):
         return record(PushState.ABORTED, why="compensation was switched off at the control; the old table is in it")
     if which in ("candidate", "off"):
         return record(PushState.ROLLBACK, why=known.stop or "activated, but not confirmed")
     return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **mismatch_doc(f, known.truth))
 
 
-def _not_in_force(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+def _not_in_force(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
     """End the push: the old table acts. A new one that the control laid aside for its next start is discarded: it would act unverified."""
     if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
     if known.forgets:
         return record(PushState.ABORTED, why="this control uses a new table only after its next start: it cannot be verified in a push")
-    text = known.verdict.text if isinstance(known.verdict, Refused) else "the activation did not happen"
+    text = known.verdict.text if isinstance(known.verdict, OperationRefused) else "the activation did not happen"
     return record(PushState.ABORTED, why=known.stop or text)
 
 
-def _forget(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
+def _forget(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
     """Make the control discard a laid-aside table by writing into its bank; only the holder of the lease may write."""
     if known.forgets >= MAX_UNANSWERED:
         why = "the control has laid the new table aside, would use it after a restart and does not discard it: do not restart the control"
@@ -260,15 +260,15 @@ def _forget(f: PushFacts, known: Knowledge, truth: Truth) -> Operation:
     return Operation(OperationKind.LEASE, owner=f.owner + 1)  # fenced off, and lower than any lease of a rollback
 
 
-def _probation(f: PushFacts, known: Knowledge) -> Operation:
+def _probation(f: PushFacts, known: PushKnowledge) -> Operation:
     return _proved(f, known, OperationKind.PROBE, PushState.PROBED)
 
 
-def _verify(f: PushFacts, known: Knowledge) -> Operation:
+def _verify(f: PushFacts, known: PushKnowledge) -> Operation:
     return _proved(f, known, OperationKind.VERIFY, PushState.VERIFIED)
 
 
-def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushState) -> Operation:
+def _proved(f: PushFacts, known: PushKnowledge, question: OperationKind, then: PushState) -> Operation:
     """Have the machine measured (probe or verification); roll back on every answer but a clear yes."""
     why = _why_back(known)
     if why:
@@ -280,14 +280,18 @@ def _proved(f: PushFacts, known: Knowledge, question: OperationKind, then: PushS
         if (truth.boot, truth.gen) != (f.boot, f.probation_gen) or in_force(f, truth) != "candidate":
             return record(PushState.ROLLBACK, why="the controller restarted, or a table was changed from outside, during probation")
         return record(PushState.ROLLBACK, why=f"not safe now: {truth.unsafe}") if truth.unsafe else Operation(question)
-    if isinstance(known.verdict, Done) and isinstance(known.verdict.value, Verdict) and known.verdict.value.passed:
+    if isinstance(known.verdict, Done) and isinstance(known.verdict.value, VerificationResult) and known.verdict.value.passed:
         return record(then, **{question.value: known.verdict.value.text})
     verdict = known.verdict
-    text = verdict.value.text if isinstance(verdict, Done) and isinstance(verdict.value, Verdict) else getattr(verdict, "text", "no answer")
+    text = (
+        verdict.value.text
+        if isinstance(verdict, Done) and isinstance(verdict.value, VerificationResult)
+        else getattr(verdict, "text", "no answer")
+    )
     return record(PushState.ROLLBACK, why=f"{question.value}: {text}")
 
 
-def _keep(f: PushFacts, known: Knowledge) -> Operation:
+def _keep(f: PushFacts, known: PushKnowledge) -> Operation:
     """Confirm again that the table in force is, byte for byte, the approved and verified one."""
     why = _why_back(known)
     if why:
@@ -302,14 +306,14 @@ def _keep(f: PushFacts, known: Knowledge) -> Operation:
     return record(PushState.KEEP)
 
 
-def _why_back(known: Knowledge) -> str:
+def _why_back(known: PushKnowledge) -> str:
     """Return why to roll back (after a crash, on a stop, without answers); empty: go on."""
     if not known.mine:
         return "interrupted before it was verified"
     return known.stop or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")
 
 
-_FORWARD: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {
+_FORWARD: dict[PushState, Callable[[PushFacts, PushKnowledge], Operation]] = {
     PushState.SNAPSHOT: _validate,
     PushState.VALIDATED: _approve,
     PushState.APPROVED: _lease,
@@ -317,7 +321,7 @@ _FORWARD: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {
     PushState.STAGING: _stage,
     PushState.STAGED: _arm,
 }
-_AFTER: dict[PushState, Callable[[PushFacts, Knowledge], Operation]] = {
+_AFTER: dict[PushState, Callable[[PushFacts, PushKnowledge], Operation]] = {
     PushState.ACTIVATING: _activate,
     PushState.PROBATION: _probation,
     PushState.PROBED: _verify,

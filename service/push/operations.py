@@ -38,9 +38,9 @@ class OperationKind(Enum):
     ACTIVATE = "activate"
     """Make a bank the active one by compare-and-swap on its CRC and the generation. Sent at most once per journal entry."""
     PROBE = "probe"
-    """Move to a few points and prove sign, axis and unit physically. Value: `Verdict`."""
+    """Move to a few points and prove sign, axis and unit physically. Value: `VerificationResult`."""
     VERIFY = "verify"
-    """Measure again and compare with before. Value: `Verdict`."""
+    """Measure again and compare with before. Value: `VerificationResult`."""
     RECORD = "record"
     """Write a journal entry to disk before anything else happens."""
     END = "end"
@@ -104,7 +104,7 @@ class Approval:
 
 
 @dataclass(frozen=True, slots=True)
-class Verdict:
+class VerificationResult:
     """Outcome of a probe or of a verification."""
 
     passed: bool
@@ -119,7 +119,7 @@ class Done:
 
 
 @dataclass(frozen=True, slots=True)
-class Refused:
+class OperationRefused:
     """The operation was understood and refused: nothing changed."""
 
     text: str
@@ -132,10 +132,10 @@ class Doubt:
     text: str
 
 
-Outcome = Done | Refused | Doubt
+Outcome = Done | OperationRefused | Doubt
 
 
-class Knowledge(NamedTuple):
+class PushKnowledge(NamedTuple):
     """What a process has learned since its start or since the last journal entry; a crash loses all of it.
 
     A process that did not begin the push (``mine`` false) knows nothing, and this alone makes the push machine recover. It is a plain tuple
@@ -215,9 +215,9 @@ class Knowledge(NamedTuple):
 _QUESTIONS = frozenset({OperationKind.VALIDATE, OperationKind.APPROVE, OperationKind.PROBE, OperationKind.VERIFY})
 
 
-def after_record(known: Knowledge, state: PushState) -> Knowledge:
+def after_record(known: PushKnowledge, state: PushState) -> PushKnowledge:
     """Knowledge after a journal entry: forget the controller's state, keep what concerns this process."""
-    return Knowledge(
+    return PushKnowledge(
         mine=known.mine,
         lease=known.lease,
         backs=known.backs,
@@ -228,7 +228,7 @@ def after_record(known: Knowledge, state: PushState) -> Knowledge:
     )
 
 
-def learn(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+def learn(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     """Knowledge after the ``outcome`` of ``op``, which is neither RECORD nor END."""
     known = known._replace(unanswered=known.unanswered + 1 if isinstance(outcome, Doubt) else 0)
     if op.kind is OperationKind.LOOK:
@@ -243,7 +243,7 @@ def learn(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     return _commanded(known, op, outcome)
 
 
-def _looked(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+def _looked(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     if not isinstance(outcome, Done) or not isinstance(outcome.value, Truth):
         return known
     if op.mark:
@@ -251,7 +251,7 @@ def _looked(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     return known._replace(truth=outcome.value)
 
 
-def _read(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+def _read(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     if isinstance(outcome, Doubt):
         return known
     done = isinstance(outcome, Done)
@@ -260,11 +260,11 @@ def _read(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     return known._replace(decoded_digest=str(outcome.value) if done and isinstance(outcome, Done) else "unreadable", truth=None)
 
 
-def _chunk(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+def _chunk(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     if op.kind is OperationKind.WRITE and op.text == FORGET:
         return known._replace(forgets=known.forgets + 1, wrote=True, truth=None)
     if op.kind is OperationKind.WRITE:
-        if isinstance(outcome, Refused):
+        if isinstance(outcome, OperationRefused):
             return known._replace(verdict=outcome, wrote=True, truth=None)
         again = int(known.differs)
         unsure = isinstance(outcome, Doubt)
@@ -278,16 +278,16 @@ def _chunk(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
     return known._replace(differs=True, unsure=False, truth=None)
 
 
-def _commanded(known: Knowledge, op: Operation, outcome: Outcome) -> Knowledge:
+def _commanded(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     known = known._replace(truth=None, start=None, image=None, decoded_digest=None)
     if op.kind is OperationKind.LEASE:
-        lease = known.lease if isinstance(outcome, Refused) else op.owner
+        lease = known.lease if isinstance(outcome, OperationRefused) else op.owner
         return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
     if op.kind is OperationKind.RELEASE:  # a refusal means that another owner has it: the old owner is shut out either way
         known = known._replace(releases=known.releases + 1, stop=known.stop or op.text)
         return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
     if op.kind is OperationKind.SEAL:
-        return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, Refused) else None)
+        return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, OperationRefused) else None)
     return known._replace(asked=True, verdict=outcome, backs=known.backs + int(op.text == BACK))
 
 
@@ -336,7 +336,7 @@ class Coherent:
     truth: Truth
 
 
-def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
+def bracket(known: PushKnowledge, bank: int, count: int, *, again: bool) -> Operation | Coherent | None:
     """Next operation of a bracket (a full read between two looks), or its end. None: the two looks differ, so something changed.
 
     ``count``: registers to read, 0 for the length in the image's header. ``again``: read a second time and decode independently.
@@ -353,12 +353,12 @@ def bracket(known: Knowledge, bank: int, count: int, *, again: bool) -> Operatio
     return Coherent(known.truth) if same else None
 
 
-def stage(image: Image, known: Knowledge) -> Operation | Failed | Coherent:
+def stage(image: Image, known: PushKnowledge) -> Operation | Failed | Coherent:
     """Next operation of staging, or its end.
 
     Coherent: the bank is sealed, and both read-backs within one generation agree in bytes and in meaning.
     """
-    if isinstance(known.verdict, Refused):
+    if isinstance(known.verdict, OperationRefused):
         return Failed(f"the controller refused: {known.verdict.text}")
     words = len(image.data) // 2
     if known.chunk * image.chunk_words < words:
@@ -368,7 +368,7 @@ def stage(image: Image, known: Knowledge) -> Operation | Failed | Coherent:
     return _read_back(image, known, words)
 
 
-def _write_chunk(image: Image, known: Knowledge) -> Operation | Failed:
+def _write_chunk(image: Image, known: PushKnowledge) -> Operation | Failed:
     first = known.chunk * image.chunk_words
     data = image.data[2 * first : 2 * (first + image.chunk_words)]
     write = Operation(OperationKind.WRITE, bank=image.bank, first=first, count=len(data) // 2, data=data)
@@ -386,7 +386,7 @@ def _write_chunk(image: Image, known: Knowledge) -> Operation | Failed:
     return write
 
 
-def _read_back(image: Image, known: Knowledge, words: int) -> Operation | Failed | Coherent:
+def _read_back(image: Image, known: PushKnowledge, words: int) -> Operation | Failed | Coherent:
     step = bracket(known, image.bank, words, again=True)
     if isinstance(step, Operation):
         return step
@@ -407,5 +407,5 @@ def _read_back(image: Image, known: Knowledge, words: int) -> Operation | Failed
     return step
 
 
-def _again(known: Knowledge, why: str) -> Operation | Failed:
+def _again(known: PushKnowledge, why: str) -> Operation | Failed:
     return Operation(OperationKind.LOOK, mark=True) if known.brackets < BRACKETS else Failed(why)

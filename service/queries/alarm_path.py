@@ -48,13 +48,13 @@ class AlarmPath:
 
 def path_of_alarm(reader: Reader, number: int) -> AlarmPath | None:
     """The way of an alarm of this service's machine; None: there is no such alarm."""
-    return next((_Facts(reader, entries).path(one) for one, entries in _alarms(reader) if one.number == number), None)
+    return next((_AlarmHistory(reader, entries).path(one) for one, entries in _alarms(reader) if one.number == number), None)
 
 
 def path_with(reader: Reader, key: Step, number: int) -> AlarmPath | None:
     """The way of the newest alarm that has an object in a step, e.g. a proposal; None: no alarm has."""
     for one, entries in _alarms(reader)[:MOST_PATHS]:
-        found = _Facts(reader, entries).path(one)
+        found = _AlarmHistory(reader, entries).path(one)
         if any(step.key == key and step.number == number for step in found.steps):
             return found
     return None
@@ -66,7 +66,7 @@ def _alarms(reader: Reader) -> list[tuple[Alarm, list[AlarmEntryRecord]]]:
     return [(one, [e for e in every if e.alarm == one.number]) for one in reversed(folded(every))]
 
 
-class _Facts:
+class _AlarmHistory:
     """What the store holds about the way of one alarm. What the service recorded for it counts first, then what came after it."""
 
     def __init__(self, reader: Reader, entries: Sequence[AlarmEntryRecord]) -> None:

@@ -90,7 +90,7 @@ class TextTable:
 
 
 @dataclass(frozen=True, slots=True)
-class Picture:
+class PictureBlock:
     """``<svg>`` elements of `abbe.service.rendering.plots` under one caption.
 
     ``layout``: two side by side, one below the other at full width, or in two columns for pictures of different heights.
@@ -110,7 +110,7 @@ class Section:
     folded: bool = False
 
 
-Block: TypeAlias = str | Lines | Facts | TextTable | Picture | Section
+Block: TypeAlias = str | Lines | Facts | TextTable | PictureBlock | Section
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -142,9 +142,9 @@ class Document:
     issuer: Issuer | None = None
 
     @property
-    def pictures(self) -> list[Picture]:
+    def pictures(self) -> list[PictureBlock]:
         """Every picture, in printed order."""
-        return [block for _, block in blocks([*self.sections, *self.appendix]) if isinstance(block, Picture)]
+        return [block for _, block in blocks([*self.sections, *self.appendix]) if isinstance(block, PictureBlock)]
 
 
 def blocks(sections: Sequence[Section]) -> Iterator[tuple[str, Block]]:

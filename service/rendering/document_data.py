@@ -18,7 +18,7 @@ from abbe.service.rendering.document import (
     Document,
     Facts,
     Lines,
-    Picture,
+    PictureBlock,
     ReportFigure,
     Section,
     TextTable,
@@ -140,7 +140,7 @@ def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:
             rows = [list(r) for r in block.rows]
             bold = [name in block.bold for name in block.head]
             return {"kind": "table", "head": list(block.head), "rows": rows, "right": _right(len(block.head), rows), "bold": bold}
-        case Picture():
+        case PictureBlock():
             return {"kind": "picture", "caption": block.caption, "svgs": [draw(s) for s in block.svgs], "layout": block.layout}
         case Section():
             inner = [_block(b, draw) for b in block.blocks]

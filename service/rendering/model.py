@@ -114,7 +114,7 @@ class Correlations:
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class Trace:
+class ResidualTrace:
     """Measured minus simulated along one run, before and after the found effects are added to the simulation; arrays of shape (n,).
 
     ``why``: reason for showing this run.

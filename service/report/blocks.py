@@ -6,7 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-from abbe.service.rendering.document import Block, Picture, Section, TextTable
+from abbe.service.rendering.document import Block, PictureBlock, Section, TextTable
 from abbe.service.rendering.model import SETUP_NOTE, Contribution, ParameterRow, ResidualSeries
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, finite, plain, tidy, with_uncertainty
 from abbe.service.rendering.plots.bars import contribution_bars, uncertainty_bars
@@ -81,7 +81,7 @@ def parameter_pictures(rows: Sequence[ParameterRow], ranked: Sequence[Contributi
     )
     machine = [r for r in rows if r.note != SETUP_NOTE]
     svgs = [*([contribution_bars(ranked)] if ranked else []), *uncertainty_bars(machine)]
-    return [Picture(caption, svgs, "flow")] if svgs else []
+    return [PictureBlock(caption, svgs, "flow")] if svgs else []
 
 
 def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
@@ -90,12 +90,12 @@ def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
     if not setup:
         return []
     pictures = uncertainty_bars(setup, key="setup")
-    drawn = [Picture(f"The same with {U_OF}.", pictures, "flow")] if pictures else []
+    drawn = [PictureBlock(f"The same with {U_OF}.", pictures, "flow")] if pictures else []
     title = f"Parameters of the set-up, found along with the machine's: {len(setup)}"
     return [Section(title, [parameter_table(setup), *drawn], folded=True)]
 
 
-def picture_section(pictures: Sequence[Picture]) -> list[Section]:
+def picture_section(pictures: Sequence[PictureBlock]) -> list[Section]:
     """The pictures of a report as a section; empty without any."""
     return [Section("Pictures", pictures)] if pictures else []
 
@@ -109,7 +109,7 @@ def residual_picture(series: Sequence[ResidualSeries], runs: Sequence[RunRow]) -
         "Measured minus modelled, all runs on one ordinate. Dashed band: ± 2 standard deviations of the reading's noise; structure that "
         "leaves the band is not in the model. Dense runs are drawn as lowest and highest value per pixel."
     )
-    return [Picture(caption, svgs)] if svgs else []
+    return [PictureBlock(caption, svgs)] if svgs else []
 
 
 def run_table(rows: Sequence[RunRow]) -> TextTable:

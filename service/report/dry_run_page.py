@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.rendering.document import Document, Picture, Section, TextTable
+from abbe.service.rendering.document import Document, PictureBlock, Section, TextTable
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.rendering.plots.views import DrawnTest, three_views
 from abbe.service.sequences.check import DryRun
@@ -34,7 +34,7 @@ def dry_run_report(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[
         "Numbers: tests that begin a set-up, in the order of measuring. Rest the pointer on a dot to read what is set up there. "
         "Nothing has moved."
     )
-    drawn = Picture(caption, [picture(machine, plan)], "wide")
+    drawn = PictureBlock(caption, [picture(machine, plan)], "wide")
     note = "Machine time, without the time that a person needs for mounting."
     sections = (Section("Paths", [*lead, drawn]), Section("Tests in order", [TextTable(headings, rows), note]))
     return Document(kind="dry-run", title=f"Dry run: {plan.name}", sections=sections, signatures=())

@@ -30,8 +30,8 @@ from abbe.service.domain.finding import EffectFound, Finding
 from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import StoreError
-from abbe.service.rendering.document import Block, Document, Facts, Lines, Picture, ReportFigure, Section, Sign, TextTable
-from abbe.service.rendering.model import PlaceMap, Trace
+from abbe.service.rendering.document import Block, Document, Facts, Lines, PictureBlock, ReportFigure, Section, Sign, TextTable
+from abbe.service.rendering.model import PlaceMap, ResidualTrace
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
 from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
 from abbe.service.report import report_parts as parts
@@ -216,16 +216,16 @@ def _pictures(found: _Found) -> list[Block]:
     out: list[Block] = []
     if finding.runs:
         text = "Measured minus simulated, run by run. Where the lower bar ends at the dashed tick, nothing but noise is left."
-        out.append(Picture(text, [gap_bars(finding.runs)], "wide"))
+        out.append(PictureBlock(text, [gap_bars(finding.runs)], "wide"))
     traces = [trace_plot(t, key=f"trace-{i}") for i, t in enumerate(_traces(found))]
     if traces:
         what = _what(finding)
         text = f"The run that shows most, simulated without and with {what}" if what else "The run with the largest gap; nothing was added"
-        out.append(Picture(f"{text}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
+        out.append(PictureBlock(f"{text}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
     places = [place_plot(p, key=f"place-{i}") for i, (a, b) in enumerate(((0, 1), (0, 2))) if (p := _place(found, a, b)) is not None]
     if places:
         text = "Gap before, divided by the noise of one reading, for each cell of the measured area. A ring marks the located area."
-        out.append(Picture(text, places))
+        out.append(PictureBlock(text, places))
     return out
 
 
@@ -276,7 +276,7 @@ def telling_run(finding: Finding) -> str | None:
     return max(shows, key=lambda label: shows[label], default=None)
 
 
-def _traces(found: _Found) -> list[Trace]:
+def _traces(found: _Found) -> list[ResidualTrace]:
     """Traces of the run that `telling_run` names: against time and, if an axis is named, against its position."""
     finding, label = found.finding, telling_run(found.finding)
     if label is None:
@@ -286,12 +286,12 @@ def _traces(found: _Found) -> list[Trace]:
         return []
     before, after = series.before.values_mm * 1e3, series.after.values_mm * 1e3
     noise, why = finding.runs[label].floor_um, "the gap shows most here"
-    out = [Trace(label, "time of the session in s", columns.t_s, before, after, noise, why)]
+    out = [ResidualTrace(label, "time of the session in s", columns.t_s, before, after, noise, why)]
     key = finding.effects[0].key if finding.effects else "".join(finding.location.axes[:1])
     if key[-1:] in AXES and key:
         x = columns.q_mm[:, AXES.index(key[-1])]
         if float(np.ptp(x)) > 0.0:
-            out.append(Trace(label, f"position of {key[-1]} in mm", x, before, after, noise, why))
+            out.append(ResidualTrace(label, f"position of {key[-1]} in mm", x, before, after, noise, why))
     return out
 
 

@@ -14,7 +14,7 @@ from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.errors import NotStored, TableMismatch
 from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts, push_log
-from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
+from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.report import report_parts as parts
@@ -212,7 +212,7 @@ def _tables(image: bytes) -> NineTables | None:
 def _drawn(tables: NineTables | None) -> list[Section]:
     if tables is None:
         return []
-    return picture_section([Picture("The new table: what is added to the command.", [table_plot(_curves(tables))], "wide")])
+    return picture_section([PictureBlock("The new table: what is added to the command.", [table_plot(_curves(tables))], "wide")])
 
 
 def _curves(tables: NineTables) -> list[TableCurve]:

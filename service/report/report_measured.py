@@ -16,7 +16,7 @@ from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment
-from abbe.service.rendering.document import Document, Picture, ReportFigure, Section, Sign, TextTable
+from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import ParameterRow, PolarTrace, ResidualSeries
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.bars import uncertainty_bars
@@ -157,7 +157,7 @@ def _solution(result: SolutionResult | None) -> Evaluated:
     drawn = result.account is None  # otherwise the section of the parameters draws them
     return Evaluated(
         figures=figures,
-        pictures=[Picture(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
+        pictures=[PictureBlock(f"{name}: linear errors with U.", [svg]) for svg in uncertainty_bars(rows)] if drawn else [],
         remarks=[*solution.flags, *solution.rough, *solution.artefacts],
         not_observable=[*solution.not_observable],
         statements=[statement],
@@ -256,7 +256,7 @@ def _own(run: Run) -> Evaluated:
     rows = [ReportFigure(group, "n", f"valid readings of {len(columns)}", float(columns.valid.sum()), None, "", "count")]
     series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
     pictures = [
-        Picture(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")
+        PictureBlock(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")
     ]
     if why := not_judged(run):
         return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
@@ -283,7 +283,7 @@ def _own(run: Run) -> Evaluated:
             return Evaluated(figures=rows, pictures=pictures, not_observable=[f"the picture of the helix: {error.detail}"])
         angle = np.degrees(about_axis(data.axes_mm - np.asarray(data.centre_mm), axis))
         text = f"Deviation of the helix around its axis ({AXES[axis]}), after a fit of centre and bar length."
-        pictures.append(Picture(text, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
+        pictures.append(PictureBlock(text, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
     return Evaluated(figures=rows, pictures=pictures)
 
 

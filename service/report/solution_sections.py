@@ -21,7 +21,7 @@ from abbe.service.identification.solve_report import (
     residual_lines,
     worst_line,
 )
-from abbe.service.rendering.document import Block, Lines, Picture, Section, TextTable
+from abbe.service.rendering.document import Block, Lines, PictureBlock, Section, TextTable
 from abbe.service.rendering.model import (
     SETUP_NOTE,
     Contribution,
@@ -89,7 +89,9 @@ def _motions(found: Assessment) -> list[Block]:
         f"Line: what was found; band: {U_OF}. Dashed: these runs do not show this motion by itself, only together with others; its curve "
         "rests on what machines usually do."
     )
-    return [Picture(caption, [motion_bands([c for c in curves if c.unit == u], key=f"motions-{i}") for i, u in enumerate(units)], "wide")]
+    return [
+        PictureBlock(caption, [motion_bands([c for c in curves if c.unit == u], key=f"motions-{i}") for i, u in enumerate(units)], "wide")
+    ]
 
 
 def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Block]:
@@ -97,7 +99,7 @@ def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Blo
         "Filled: these runs show the motion by itself. Outline only: in every reading, part of the motion looks like another error, however"
         " long its bar; do not put it into a compensation table of its own."
     )
-    out: list[Block] = [layout_line(found.observability.number), Picture(caption, [share_plot(shares)])]
+    out: list[Block] = [layout_line(found.observability.number), PictureBlock(caption, [share_plot(shares)])]
     if found.observability.advice:
         out.append(Section("What would show more", [Lines([a.text for a in found.observability.advice])]))
     pairs = _correlations(found)
@@ -106,7 +108,7 @@ def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Blo
             "Parameters whose errors go together: orange, both too large or both too small; blue, one makes up for the other. Near ± 1 "
             "only their sum or difference is known."
         )
-        out.append(Picture(caption, [correlation_plot(pairs)]))
+        out.append(PictureBlock(caption, [correlation_plot(pairs)]))
     return out
 
 
@@ -117,8 +119,10 @@ def _volume(found: Assessment) -> list[Block]:
     gains = [gain_map(_gain(found, fixed), key=f"gain-{i}") for i, (_, _, fixed) in enumerate(PLANES)]
     return [
         worst_line(found),
-        Picture("Half-axis of the 95 % region of the predicted deviation vector, best-fit rigid motion removed. One colour scale.", maps),
-        Picture(
+        PictureBlock(
+            "Half-axis of the 95 % region of the predicted deviation vector, best-fit rigid motion removed. One colour scale.", maps
+        ),
+        PictureBlock(
             "Predicted deviation, µm, per µm of reading noise: high where readings are few or far away. More or better readings help "
             "there; elsewhere the assumptions about machines decide.",
             gains,

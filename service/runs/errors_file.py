@@ -82,7 +82,7 @@ def axis_function(one: formats.ErrorFunction) -> AxisFunction:
     ValueError
         The function is impossible: positions that do not increase, decreasing knots, no coefficient.
     """
-    if isinstance(one, formats.Polynomial):
+    if isinstance(one, formats.PolynomialObject):
         return Polynomial(np.array(one.coefficients), one.origin_mm)
     if isinstance(one, formats.LegendreSeries):
         return Legendre(np.array(one.coefficients), one.stroke_mm)

@@ -37,7 +37,7 @@ def no_image(crc: int) -> bytes | None:
 
 
 @dataclass(frozen=True, slots=True)
-class Folder:
+class FolderContent:
     """Content of a checked campaign folder: ``campaign.json``, its runs in order, and the errors file of its ``current_model``.
 
     ``run_files``: the documents of ``runs`` as they stand in the files, for an import that keeps unknown keys. ``tables``: images of the
@@ -51,7 +51,7 @@ class Folder:
     tables: dict[int, bytes]
 
 
-def read_folder(folder: Path) -> Folder:
+def read_folder(folder: Path) -> FolderContent:
     """Read and check a folder with ``campaign.json`` and its run files.
 
     Raises
@@ -84,7 +84,7 @@ def read_folder(folder: Path) -> Folder:
         path = folder / parsed.current_model.errors
         errors = read_json(path)
         check(path, errors, ErrorsFile)
-    return Folder(campaign, files, runs, errors, _tables(folder, runs))
+    return FolderContent(campaign, files, runs, errors, _tables(folder, runs))
 
 
 def _tables(folder: Path, runs: list[Run]) -> dict[int, bytes]:
@@ -128,7 +128,7 @@ def import_folder(store: Store, folder: Path) -> int:
     return store_folder(store, read_folder(folder))
 
 
-def store_folder(store: Store, content: Folder) -> int:
+def store_folder(store: Store, content: FolderContent) -> int:
     """Store a checked campaign, completely or not at all, and return its id.
 
     Raises

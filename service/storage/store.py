@@ -15,7 +15,7 @@ from abbe.service.storage.engine import head_revision, revision_of
 from abbe.service.storage.repositories.measured import Campaigns, Checkpoints, Chunks, Machines, Runs
 from abbe.service.storage.repositories.pages import Pages
 from abbe.service.storage.repositories.people import People
-from abbe.service.storage.repositories.results import Discoveries, Models, Proposals, Pushes, Solutions, Tables, Verifications
+from abbe.service.storage.repositories.results import CompensationTables, Discoveries, Models, Proposals, Pushes, Solutions, Verifications
 from abbe.service.storage.repositories.service_records import Alarms, Audit, Heartbeats, Outbox, Replies, Slots
 from abbe.service.storage.tables import identity, machines, outbox
 
@@ -30,7 +30,7 @@ class Store(Database):
         super().__init__(engine, writer, utcnow)
         self.machines, self.campaigns = Machines(self), Campaigns(self)
         self.runs, self.chunks, self.checkpoints = Runs(self), Chunks(self), Checkpoints(self)
-        self.solutions, self.tables, self.verifications = Solutions(self), Tables(self), Verifications(self)
+        self.solutions, self.tables, self.verifications = Solutions(self), CompensationTables(self), Verifications(self)
         self.discoveries, self.models = Discoveries(self), Models(self)
         self.proposals, self.pushes = Proposals(self), Pushes(self)
         self.alarms, self.slots, self.heartbeats = Alarms(self), Slots(self), Heartbeats(self)

@@ -142,7 +142,7 @@ LOCAL_VIEWER = Principal("anonymous", Role.VIEWER, ALLOWED[Role.VIEWER])
 """Any visitor of a service without users, which listens on this computer only and is read-only."""
 
 
-class People:
+class UserAccounts:
     """Users of one database."""
 
     def __init__(self, store: Store, clock: Clock, passwords: Passwords | None = None) -> None:

@@ -6,7 +6,7 @@ import numpy as np
 
 from abbe.models.evaluation.iso230_2 import ScaleBudget, Value, positioning
 from abbe.service.domain.document import Doc
-from abbe.service.domain.imported_file import Origin, OtherReadings, StatedFigure
+from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
 from abbe.service.rendering.document import ReportFigure
 from abbe.service.verification.iso_readings import approaches_of
 from abbe.service.verification.iso_report import UM, Evaluated, positioning_rows
@@ -30,7 +30,7 @@ def evaluate_imported(campaign: Doc) -> Evaluated:
         out.figures.append(ReportFigure(f"{one.group}, {one.file}", one.symbol, one.name, one.value, None, one.unit, STATED))
     out.not_observable += [NO_U] if campaign.get("stated") else []
     for doc in campaign.get("origins", ()):
-        origin = Origin.read(doc)
+        origin = SourceFile.read(doc)
         out.remarks += [f"{origin.file} ({origin.format}) does not say: {text}" for text in origin.unknown]
         out.conditions[f"File {origin.file}"] = "; ".join(f"{name}: {value}" for name, value in origin.said.items()) or origin.format
     return out

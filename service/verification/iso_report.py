@@ -16,7 +16,7 @@ from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.domain.material import AxisMaterial
 from abbe.service.domain.run import Run
-from abbe.service.rendering.document import Picture, ReportFigure
+from abbe.service.rendering.document import PictureBlock, ReportFigure
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.numbers import plain
 from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
@@ -56,7 +56,7 @@ class Evaluated:
     """
 
     figures: list[ReportFigure] = field(default_factory=list)
-    pictures: list[Picture] = field(default_factory=list)
+    pictures: list[PictureBlock] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     not_observable: list[str] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
@@ -181,13 +181,13 @@ def _figure(group: str, symbol: str, name: str, value: Value | None, method: str
     return ReportFigure(group, symbol, name, value.value_mm * UM, value.u_mm * UM, "µm", method)
 
 
-def _positioning(label: str, x_label: str, p: Positioning) -> Picture:
+def _positioning(label: str, x_label: str, p: Positioning) -> PictureBlock:
     s = [None if v is None else v * UM for v in (p.s_forward_mm, p.s_backward_mm)]
     curves = PositioningCurves(label, x_label, p.position_mm, p.mean_forward_mm * UM, p.mean_backward_mm * UM, *s)
     text = ", ".join(f"{n} {plain(v.value_mm * UM)} µm" for n, v in (("E", p.E), ("B", p.B), ("R", p.R), ("A", p.A)) if v is not None)
     bars = "; bars are two standard deviations to both sides" if p.s_forward_mm is not None else ""
     caption = f"{label}: mean deviation of both directions{bars}. {text}."
-    return Picture(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=text)], "wide")
+    return PictureBlock(caption, [positioning_plot(curves, key=f"positioning-{label}", figures=text)], "wide")
 
 
 def _diagonals(
@@ -242,7 +242,7 @@ def _circles(out: Evaluated, tests: list[CircleTest]) -> None:
             out.not_observable.append(f"G(b) and H of plane {plane}, set-up {setup}: the circle was driven in one sense only")
         traces = [_trace(t) for t in same]
         caption = f"Plane {plane}, set-up {setup}: radial deviation about the least squares centre."
-        out.pictures.append(Picture(caption, [polar_plot(traces, key=f"polar-{plane}-{setup}", heading=f"Circle {plane}")]))
+        out.pictures.append(PictureBlock(caption, [polar_plot(traces, key=f"polar-{plane}-{setup}", heading=f"Circle {plane}")]))
 
 
 def _sense(test: CircleTest) -> str:

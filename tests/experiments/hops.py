@@ -156,13 +156,13 @@ def push() -> Hops:
     from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls, open_session
-    from abbe.service.push.operations import Verdict
+    from abbe.service.push.operations import VerificationResult
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
     from abbe.service.tables.nine_tables import read_base
 
-    async def yes() -> Verdict:
-        return Verdict(True, "a stand-in")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "a stand-in")
 
     async def work(machine: Path, hops: Hops) -> None:
         site = site_of(load_machine(machine).machine)

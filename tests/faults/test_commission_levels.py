@@ -18,7 +18,7 @@ from abbe.service.compensation.proved_levels import check_level, level_status
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.errors import StillActive, TableRefused, UnsafeToMove
 from abbe.service.push.journal import facts
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc import bank
@@ -164,8 +164,8 @@ def small_tables(b, slope: float = 1e-5) -> NineTables:
 
 
 async def push(b, store, *, attended: bool, slope: float = 1e-5) -> PushResult:
-    async def yes() -> Verdict:
-        return Verdict(True, "a stand-in")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "a stand-in")
 
     wanted = WantedTable(small_tables(b, slope), await read_base(b.session.controller), 100, None, {})
     pushing = Pushing(b.session.controller, store, b.site, attended=attended)
@@ -308,12 +308,12 @@ async def test_an_unfinished_push_goes_first_for_the_bank_at_rest_holds_its_old_
     before = in_force(b)
     controller = b.sim.world.controller
 
-    async def cut() -> Verdict:
+    async def cut() -> VerificationResult:
         controller.switches.spindle_turning = True  # from here on nothing can be activated, the way back included
-        return Verdict(False, "worse")
+        return VerificationResult(False, "worse")
 
-    async def yes() -> Verdict:
-        return Verdict(True, "a stand-in")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "a stand-in")
 
     wanted = WantedTable(small_tables(b), await read_base(b.session.controller), 100, None, {})
     with pytest.raises(StillActive):

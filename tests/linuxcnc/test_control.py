@@ -21,7 +21,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import DeviceUrls
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
@@ -96,8 +96,8 @@ def tables_of_nine(image: TableImage) -> NineTables:
 async def bring(cnc: ModbusController, store: Store, site: Site, tables: NineTables, *, attended: bool = True) -> PushResult:
     """Push as a job does, with stand-ins for what would be measured."""
 
-    async def yes() -> Verdict:
-        return Verdict(True, "a stand-in")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "a stand-in")
 
     wanted = WantedTable(tables, await read_base(cnc), 100, None, {})
     return await Pushing(cnc, store, site, attended=attended).bring(wanted, Questions(list, "a test", yes, yes))

@@ -91,11 +91,11 @@ def people(clock: SystemClock, *, better: bool) -> PushActors:
     async def approve(journal: Any) -> o.Approval:
         return o.Approval(facts(journal).binding("today"), "a test", "today", clock.monotonic_s() + 60.0)
 
-    async def probe(journal: Any) -> o.Verdict:
-        return o.Verdict(True, "stand-in")
+    async def probe(journal: Any) -> o.VerificationResult:
+        return o.VerificationResult(True, "stand-in")
 
-    async def verify(journal: Any) -> o.Verdict:
-        return o.Verdict(better, "stand-in")
+    async def verify(journal: Any) -> o.VerificationResult:
+        return o.VerificationResult(better, "stand-in")
 
     return PushActors(validate, approve, probe, verify)
 

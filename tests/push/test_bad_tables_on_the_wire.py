@@ -14,7 +14,7 @@ from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableRefused
 from abbe.service.push.limits import PushLimits
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.push.validate import reasons_against
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
@@ -43,12 +43,12 @@ def counted(registers: Any) -> list[int]:
     return seen
 
 
-async def never() -> Verdict:
+async def never() -> VerificationResult:
     raise AssertionError("a rejected table is neither probed nor verified")
 
 
-async def kept() -> Verdict:
-    return Verdict(True, "a stand-in")
+async def kept() -> VerificationResult:
+    return VerificationResult(True, "a stand-in")
 
 
 @pytest.mark.timeout(120)

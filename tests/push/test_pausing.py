@@ -13,7 +13,7 @@ import pytest
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.errors import Stopped
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
@@ -36,9 +36,9 @@ class Told(Pushing):
         self.control.pause()
         self.paused.append(self.control.pausing)
 
-    async def question(self) -> Verdict:
+    async def question(self) -> VerificationResult:
         self.ask()
-        return Verdict(True, "a stand-in")
+        return VerificationResult(True, "a stand-in")
 
 
 @asynccontextmanager

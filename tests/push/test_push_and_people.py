@@ -18,7 +18,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import PushNotBegun, StillActive, TableMismatch
 from abbe.service.push.execute import BEAT_S, ControllerPort, no_actors
-from abbe.service.push.operations import Done, Operation, OperationKind, Verdict
+from abbe.service.push.operations import Done, Operation, OperationKind, VerificationResult
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc.compensation import CompResult
@@ -78,14 +78,14 @@ async def test_a_measurement_ends_when_another_takes_the_lease_and_its_table_is_
     b, store = machine
     comp, ended = b.sim.world.controller.comp, []
 
-    async def taken() -> Verdict:
+    async def taken() -> VerificationResult:
         comp._owner = OTHER
         try:
             await asyncio.sleep(60.0)
         except asyncio.CancelledError:
             ended.append("in time")
             raise
-        return Verdict(True, "measured to its end under another's lease")
+        return VerificationResult(True, "measured to its end under another's lease")
 
     with pytest.raises(StillActive, match="another owner has the lease"):
         await brought(b, store, Jumping(), Questions(list, "a test", kept, taken))

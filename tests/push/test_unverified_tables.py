@@ -12,7 +12,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from tests.faults.sequencer_world import Bench, bench
@@ -21,8 +21,8 @@ from tests.push.test_bad_tables_on_the_wire import kept, never, tables
 OTHER = 0x00990001
 
 
-async def no() -> Verdict:
-    return Verdict(False, "the other way")
+async def no() -> VerificationResult:
+    return VerificationResult(False, "the other way")
 
 
 @dataclass

@@ -21,7 +21,7 @@ from abbe.service.domain.machine import DeviceUrls, address_of, control_of
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableMismatch, UnsafeToMove
 from abbe.service.push.journal import NO_PUSH, StoreBook, check_chain
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.report.report_table import table_remarks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
@@ -208,13 +208,13 @@ async def left_in_probation(folder: Path, wanted: NineTables | None = None) -> A
         b.sim.pace(100.0)
         controller, whole, killed = b.session.controller, folder / "whole.sqlite3", folder / "killed.sqlite3"
 
-        async def copies() -> Verdict:
+        async def copies() -> VerificationResult:
             with closing(sqlite3.connect(whole)) as old, closing(sqlite3.connect(killed)) as new:
                 old.backup(new)
-            return Verdict(True, "a stand-in")
+            return VerificationResult(True, "a stand-in")
 
-        async def kept() -> Verdict:
-            return Verdict(True, "a stand-in")
+        async def kept() -> VerificationResult:
+            return VerificationResult(True, "a stand-in")
 
         with Store.open(f"sqlite:///{whole}") as store:
             base = await read_base(controller)

@@ -24,7 +24,7 @@ from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
 from abbe.service.push.journal import StoreBook, check_chain
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
@@ -104,8 +104,8 @@ async def active(session) -> tuple[int, int]:
     return now.active_bank, now.bank_crc[now.active_bank]
 
 
-async def yes() -> Verdict:
-    return Verdict(True, "a stand-in")
+async def yes() -> VerificationResult:
+    return VerificationResult(True, "a stand-in")
 
 
 async def push(controller, store, site, tables, *, base=None, probe=yes, verify=yes, validate=list):
@@ -200,9 +200,9 @@ async def test_every_entry_acts_on_its_own_axis_with_its_own_sign(start_sims, tm
             slopes[a, i] = 1e-4
             change: list[np.ndarray] = []
 
-            async def read(name: str = f"over {a} out {i}", change: list[np.ndarray] = change) -> Verdict:
+            async def read(name: str = f"over {a} out {i}", change: list[np.ndarray] = change) -> VerificationResult:
                 change.append(await measured(name) - base)
-                return Verdict(False, "a test")
+                return VerificationResult(False, "a test")
 
             assert not (await push(session.controller, store, site, linear_tables(site, slopes), verify=read)).kept
             unit = signs * length / np.linalg.norm(length)
@@ -215,9 +215,9 @@ async def test_an_interlock_keeps_the_table_pending_and_the_next_start_takes_it_
     async with bench(sims, tmp_path) as (site, store, session):
         before = await active(session)
 
-        async def worse() -> Verdict:
+        async def worse() -> VerificationResult:
             sims.ask("estop", on=True)
-            return Verdict(False, "not better")
+            return VerificationResult(False, "not better")
 
         with pytest.raises(StillActive, match="STILL ACTIVE"):
             await push(session.controller, store, site, steep(site), verify=worse)
@@ -242,10 +242,10 @@ async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_sta
                 raise StoreError("the disk is full")
             return await honest(self, journal, wanted, doc)
 
-        async def meanwhile() -> Verdict:
+        async def meanwhile() -> VerificationResult:
             with pytest.raises(UnsafeToMove, match="under way"):  # as long as it is being pushed
                 await recover(session.controller, store, site)
-            return Verdict(True, "a stand-in")
+            return VerificationResult(True, "a stand-in")
 
         with monkeypatch.context() as patch:
             patch.setattr(StoreBook, "append", dies)
@@ -268,7 +268,7 @@ async def test_where_the_old_table_was_overwritten_the_unverified_one_is_named(s
     async with bench(sims, tmp_path) as (site, store, session):
         controller = session.controller
 
-        async def overwritten() -> Verdict:
+        async def overwritten() -> VerificationResult:
             now = await controller.comp_status()
             await controller.write_bank(1 - now.active_bank, encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7)))
             raise MeasurementFault("the bar fell off")
@@ -286,8 +286,8 @@ async def test_a_refuted_table_that_somebody_activates_later_is_known_for_what_i
     async with bench(sims, tmp_path) as (site, store, session):
         controller = session.controller
 
-        async def refuted() -> Verdict:
-            return Verdict(False, "the other way")
+        async def refuted() -> VerificationResult:
+            return VerificationResult(False, "the other way")
 
         gone = await push(controller, store, site, steep(site), probe=refuted)
         assert not gone.kept
@@ -310,7 +310,7 @@ async def test_a_table_that_nobody_knows_stops_everything_until_a_person_accepts
     async with bench(sims, tmp_path) as (site, store, session):
         controller = session.controller
 
-        async def by_hand() -> Verdict:
+        async def by_hand() -> VerificationResult:
             image = encode(table_image(linear_tables(site, np.full((3, 3), 2e-6)), 100, 7))
             now = await controller.comp_status()
             await controller.release(now.lease_owner)
@@ -320,7 +320,7 @@ async def test_a_table_that_nobody_knows_stops_everything_until_a_person_accepts
             await controller.seal(other, 7)
             await controller.activate(other, expect_crc=crc32(image), expect_gen=(await controller.comp_status()).gen, owner=7)
             await controller.release(7)
-            return Verdict(True, "a stand-in")
+            return VerificationResult(True, "a stand-in")
 
         with pytest.raises(TableMismatch, match="neither the old nor the new"):
             await push(controller, store, site, steep(site), verify=by_hand)

@@ -9,7 +9,7 @@ from abbe.service.compensation.recover import recover
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import StoreError
 from abbe.service.push.journal import StoreBook
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.tables.nine_tables import read_base
 from tests.scenarios.test_push import active, bench, last, push, steep
 
@@ -40,7 +40,7 @@ async def test_whoever_stops_it_hears_that_the_table_is_still_active(start_sims,
     async with bench(sims, tmp_path) as (site, store, session):
         before, task = await active(session), asyncio.current_task()
 
-        async def stopped() -> Verdict:
+        async def stopped() -> VerificationResult:
             sims.ask("estop", on=True)
             task.cancel()
             await asyncio.Event().wait()
@@ -55,7 +55,7 @@ async def test_whoever_stops_it_hears_that_the_table_is_still_active(start_sims,
         await session.controller.reset_alarm()
         assert "made active again" in await recover(session.controller, store, site)
 
-        async def just_stopped() -> Verdict:
+        async def just_stopped() -> VerificationResult:
             task.cancel()
             await asyncio.Event().wait()
             raise AssertionError
@@ -72,9 +72,9 @@ async def test_a_stop_that_comes_before_a_question_moves_nothing(start_sims, tmp
     async with bench(sims, tmp_path) as (site, store, session):
         task, asked = asyncio.current_task(), []
 
-        async def never() -> Verdict:
+        async def never() -> VerificationResult:
             asked.append(1)
-            return Verdict(True, "a stand-in")
+            return VerificationResult(True, "a stand-in")
 
         class StopsBeforeTheProbe(Pushing):
             async def _run_question(self, question):

@@ -27,7 +27,7 @@ from abbe.service.config import load_machine
 from abbe.service.devices.session import open_session
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.verification import CheckResult
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.rendering.numbers import with_uncertainty
 from abbe.service.runs.columns import load_run
 from abbe.service.scheduler import record
@@ -108,8 +108,8 @@ async def pushed(machine_file: Path) -> None:
     none = tuple(np.zeros_like(c) for c in curves)
     tables = quantise(NineTables(grids, (curves[0], curves[1], curves[2]), (none[0], none[1], none[2])), 1e-4)
 
-    async def yes() -> Verdict:
-        return Verdict(True, "seen by hand")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "seen by hand")
 
     with Store.open(f"sqlite:///{machine_file.parent / 'abbe.sqlite3'}") as store:
         async with open_session(site.urls) as session:

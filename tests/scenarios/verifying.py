@@ -22,7 +22,7 @@ from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.domain.run import Run
 from abbe.service.push.journal import check_chain
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
@@ -83,8 +83,8 @@ async def _prepared(shop: Shop) -> None:
     with Store.open(shop.url) as store:
         async with open_session(shop.site.urls) as session:
 
-            async def yes() -> Verdict:
-                return Verdict(True, "the table that is there")
+            async def yes() -> VerificationResult:
+                return VerificationResult(True, "the table that is there")
 
             wanted = WantedTable(shop.tables(**BASE), await read_base(session.controller), 100, None, {})
             assert (await Pushing(session.controller, store, shop.site).bring(wanted, Questions(list, "a test", yes, yes))).kept
@@ -109,10 +109,10 @@ class Push:
     async def bring(self) -> PushResult:
         self.pushing = Pushing(self.session.controller, self.store, self.shop.site)
 
-        async def yes() -> Verdict:
-            return Verdict(True, "a stand-in")
+        async def yes() -> VerificationResult:
+            return VerificationResult(True, "a stand-in")
 
-        async def verify() -> Verdict:
+        async def verify() -> VerificationResult:
             try:
                 return await self._verify()
             finally:
@@ -125,14 +125,14 @@ class Push:
             self.took_s = time.monotonic() - self.told_s
             print(f"ended {self.took_s:.2f} s after the verdict")  # noqa: T201
 
-    async def _verify(self) -> Verdict:
+    async def _verify(self) -> VerificationResult:
         self.shop.number += 1
         plan = replace(self.plan or plan_of(self.shop.site, ""), name=f"after {self.shop.number}")
         ids = await measure(self.session, self.store, self.shop.site, plan, progress=self._watch)
         runs = await load_runs(self.store, ids)
         self.alter(runs)
         decision = decide(self.shop.before, figures(runs), self.pushing.crc)
-        return Verdict(decision.keep, decision.text)
+        return VerificationResult(decision.keep, decision.text)
 
     def _watch(self, p: Progress) -> None:
         if self.meanwhile is not None and p.stage.startswith("after") and p.done > 0.5 * p.total:

@@ -26,7 +26,7 @@ from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import Topics
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.scheduler import alarm_manager
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
@@ -44,7 +44,7 @@ def say(word: str) -> None:
     sys.stdout.flush()
 
 
-async def probing(session: Session, store: Store, site: Site, order: PushOrder, last: str) -> Verdict:
+async def probing(session: Session, store: Store, site: Site, order: PushOrder, last: str) -> VerificationResult:
     """Axes on their way for as long as nobody stops them. ``last``: what the fixture is asked for when that happens."""
     told: list[Progress] = []
 
@@ -79,7 +79,7 @@ def duties_on(site: Site, last: str) -> Any:
                         linear_tables(site, np.full((3, 3), 1e-5)), await read_base(session.controller), 100, None, {"proposal": 4}
                     )
 
-                    async def probe() -> Verdict:
+                    async def probe() -> VerificationResult:
                         return await probing(session, store, site, order, last)
 
                     done = await Pushing(session.controller, store, site, control=order.control).bring(

@@ -21,7 +21,7 @@ from abbe.drivers.links.modbus_link import Canary, ModbusLink, ModbusOperation
 from abbe.drivers.links.urls import ModbusRtuUrl, ModbusTcpUrl
 from abbe.models.compensation.tables import NineTables, grid_positions
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from abbe.simulators.cnc.device import Controller
@@ -263,8 +263,8 @@ async def test_mbpoll_reads_the_numbers_of_the_table_that_was_pushed(require, tm
     """The whole way of a table: the push machine writes it through our driver into the simulated controller, mbpoll reads it."""
     require("mbpoll", shutil.which("mbpoll") is not None, "mbpoll is not installed")
 
-    async def yes() -> Verdict:
-        return Verdict(True, "a stand-in")
+    async def yes() -> VerificationResult:
+        return VerificationResult(True, "a stand-in")
 
     async with bench(tmp_path, seed=5) as b:
         b.sim.pace(20.0)

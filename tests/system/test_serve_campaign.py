@@ -24,7 +24,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.storage.store import Store
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.world import wait_for
 from tests.system.serve_bench import Process, abbe, free_port
@@ -42,7 +42,7 @@ SET_UPS = 19
 
 def tokens(url: str) -> dict[str, dict[str, str]]:
     with Store.open(url) as store:
-        people = People(store, SystemClock(), Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, SystemClock(), Passwords(memory_kib=64, passes=1))
         found = {}
         for name, role, scopes in (("mia", "metrologist", ["read", "measure", "propose"]), ("vera", "viewer", ["read"])):
             people.add(name, role, PHRASE)

@@ -28,7 +28,7 @@ from websockets.sync.client import connect
 
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
-from abbe.service.users.people import People
+from abbe.service.users.people import UserAccounts
 from tests.system.serve_bench import Machine, Process, abbe, free_port
 from tests.system.test_serve_page import Seen, browser, only_us, shot
 from tests.system.test_serve_screens import INSIDE, SIZES, SMALL, violations
@@ -78,7 +78,7 @@ class Serving:
 def serving(folder: Path, speed: float) -> Iterator[Serving]:
     url, port = f"sqlite:///{folder / 'abbe.sqlite3'}", free_port()
     with Store.open(url) as store:
-        people = People(store, SystemClock())
+        people = UserAccounts(store, SystemClock())
         people.add("olga", "operator", PHRASE)
         token = people.add_token("olga", "test", ["read"], 5.0)
     machine = Machine(folder, speed, "[web]", f"port = {port}", *TIMETABLE)

@@ -22,7 +22,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
-from abbe.service.users.people import People
+from abbe.service.users.people import UserAccounts
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.system.serve_bench import Machine, Process, abbe, free_port, service
 from tests.system.test_serve_stop import slots_of
@@ -39,7 +39,7 @@ def tokens(folder: Path) -> dict[str, dict[str, str]]:
     """A user of each role, and the header with his token."""
     made = {}
     with Store.open(url_of(folder)) as store:
-        people = People(store, SystemClock())
+        people = UserAccounts(store, SystemClock())
         for role in Role:
             people.add(f"a-{role}", role, PHRASE)
             scopes = sorted(ALLOWED[role])
@@ -285,7 +285,7 @@ def test_a_job_is_started_once_steered_and_refused_and_the_service_ends_soon(mad
     assert status["job"] is None
     assert status["last"][0]["cause"]["code"] == "SEQ-004"
     with Store.open(url_of(shared_folder)) as store:  # whoever is shut out meanwhile: the next word of his is refused
-        People(store, SystemClock()).disable("a-operator")
+        UserAccounts(store, SystemClock()).disable("a-operator")
     assert made.start("quick").status_code == 401
     page = made.web
     code, took_s = made.process.terminate()

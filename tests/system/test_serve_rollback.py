@@ -16,7 +16,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.push_entry import PushState
 from abbe.service.push.journal import check_chain
 from abbe.service.storage.store import Store
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.web.api.once import REPLAYED
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.test_push import bench, push, steep
@@ -40,7 +40,7 @@ async def pushed(sims: Sims, folder: Path) -> tuple[int, int]:
 
 def tokens(url: str) -> dict[str, dict[str, str]]:
     with Store.open(url) as store:
-        people = People(store, SystemClock(), Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, SystemClock(), Passwords(memory_kib=64, passes=1))
         found = {}
         for name, role, scopes in (("ann", "approver", ["read", "approve"]), ("bob", "operator", ["read", "measure"])):
             people.add(name, role, PHRASE)

@@ -18,7 +18,7 @@ from cryptography.x509.oid import NameOID
 
 from abbe.service.clock import SystemClock
 from abbe.service.storage.store import Store
-from abbe.service.users.people import People
+from abbe.service.users.people import UserAccounts
 from tests.system.serve_bench import abbe, free_port
 
 Refused = Callable[..., list[str]]
@@ -28,7 +28,7 @@ MACHINE = 'name = "mill-7"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY 
 
 def add_user(folder: Path) -> None:
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
-        People(store, SystemClock()).add("ana", "admin", PHRASE)
+        UserAccounts(store, SystemClock()).add("ana", "admin", PHRASE)
 
 
 def certificate(folder: Path) -> None:

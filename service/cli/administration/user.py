@@ -26,7 +26,7 @@ from abbe.service.cli.common import (
 
 if TYPE_CHECKING:
     from abbe.service.storage.store import Store
-    from abbe.service.users.people import People
+    from abbe.service.users.people import UserAccounts
 
 
 user = typer.Typer(help="Users of the pages and the HTTP interface: viewer, operator, metrologist, approver, admin.", no_args_is_help=True)
@@ -152,14 +152,14 @@ def _said(name: str, text: str, where: tuple[str | None, Path | None], *, as_jso
 
 
 @contextmanager
-def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) -> Iterator[tuple[People, Store]]:
+def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) -> Iterator[tuple[UserAccounts, Store]]:
     from abbe.service.clock import SystemClock
-    from abbe.service.users.people import People
+    from abbe.service.users.people import UserAccounts
 
     url = database_url(db, machine)
     with open_store(url, must_exist=must_exist) as store:
         warn_of_readers(url)
-        yield People(store, SystemClock()), store
+        yield UserAccounts(store, SystemClock()), store
 
 
 def _password() -> str:

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
     from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal
-    from abbe.service.discovery.discover_live import Addition
+    from abbe.service.discovery.discover_live import LiveAddition
     from abbe.service.domain.finding import Finding
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
@@ -153,7 +153,7 @@ def _run_live(
     return job, journal, finding
 
 
-def _measured(store: Store, site: Site, campaign: Campaign, addition: Addition, *, accept_table: bool) -> float:
+def _measured(store: Store, site: Site, campaign: Campaign, addition: LiveAddition, *, accept_table: bool) -> float:
     """Measure the runs of an addition that are still missing. Return the seconds to wait if it is too early to measure, else 0."""
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.running import display, run_job

@@ -16,7 +16,7 @@ from abbe.service.reference.papers.pahk import EXAMPLE, Cmm, example, machine_in
 from abbe.service.reference.papers.yang import bar_line_um, restored_x_mm
 from abbe.service.reference.printed import values
 from abbe.service.reference.text import minus, short
-from abbe.service.rendering.document import Picture
+from abbe.service.rendering.document import PictureBlock
 from abbe.service.rendering.plots.curves import ComparedReadings, comparison_plot
 from abbe.service.rendering.plots.isometric import lobing_plot, surface_plot
 from abbe.service.rendering.plots.maps import SignedScale, Surface, contour_plot
@@ -27,7 +27,7 @@ SURFACE_NODES = 41
 """Nodes per side of Kwon's square in the pictures of a surface: the paper's nine, and four between neighbours."""
 
 
-def figures(paper: Paper) -> list[Picture]:
+def figures(paper: Paper) -> list[PictureBlock]:
     """Return the pictures of one paper, in printed order."""
     if paper == "pahk":
         return [_probe(), _machines()]
@@ -38,7 +38,7 @@ def figures(paper: Paper) -> list[Picture]:
     return []
 
 
-def _surfaces() -> list[Picture]:
+def _surfaces() -> list[PictureBlock]:
     z = plane().z_mm
     drawn = {c: _surface(c, z) for c in kwon_printed.COMPONENTS}
     scale = SignedScale.around(*(s.values for s in drawn.values()))
@@ -51,8 +51,8 @@ def _surfaces() -> list[Picture]:
     spatial = tuple(surface_plot(s, scale, key=f"surface-{c}", heading=f"{c} over the plane") for c, s in drawn.items())
     flat = tuple(contour_plot(s, scale, key=f"contour-{c}", heading=f"{c}, level lines") for c, s in drawn.items())
     return [
-        Picture(f"Kwon, Fig. 11: {text}", spatial),
-        Picture(f"Kwon, Fig. 12: level lines of the same {text}", flat),
+        PictureBlock(f"Kwon, Fig. 11: {text}", spatial),
+        PictureBlock(f"Kwon, Fig. 12: level lines of the same {text}", flat),
     ]
 
 
@@ -69,7 +69,7 @@ def _hemisphere(step_deg: float) -> tuple[F1, F1]:
     return low, around
 
 
-def _probe() -> Picture:
+def _probe() -> PictureBlock:
     found = example()
     coarse, fine = _hemisphere(6.0), _hemisphere(2.0)
     relief, chart = found.values_um(*coarse), found.values_um(*fine)
@@ -87,16 +87,16 @@ def _probe() -> Picture:
         f" (Reff {found.calibration.effective_radius_mm:.4f} mm, map within {short(1e3 * found.largest_mm)} µm of the assumed one),"
         " bilinear between the touches. Positive: the probe triggers late. Dashed: equator of the ball without error."
     )
-    return Picture(caption, pictures)
+    return PictureBlock(caption, pictures)
 
 
-def _machines() -> Picture:
+def _machines() -> PictureBlock:
     caption = (
         "Pahk, Figs. 5 and 7(a): volumetric error of CMM A and CMM B, 5 × 5 × 5 nodes, tool relative to workpiece, Y line as datum"
         " as in the paper. It contains only the three printed squareness errors: the positional, straightness and angular curves of Figs. 4"
         " and 6 are lost, so these are not the paper's maps. Dashed: as commanded; solid: with the errors magnified as each picture states."
     )
-    return Picture(caption, tuple(_machine(cmm) for cmm in pahk.CMMS))
+    return PictureBlock(caption, tuple(_machine(cmm) for cmm in pahk.CMMS))
 
 
 def _machine(cmm: Cmm) -> str:
@@ -112,7 +112,7 @@ def _machine(cmm: Cmm) -> str:
     return deformed_grid(grid, 1e3 * deviation, key=f"pahk-{cmm.type_name}", heading=heading)
 
 
-def _laser_and_bar() -> Picture:
+def _laser_and_bar() -> PictureBlock:
     x = np.array(restored_x_mm())
     laser, bar, _ = yang_printed.TABLE2["dxx"]
     data = ComparedReadings(
@@ -129,4 +129,4 @@ def _laser_and_bar() -> Picture:
         "Yang and Kim, Fig. 7: δxx (EXX) by laser (Table 3, the eighth position restored to 254.0 mm) with the two first-order lines of"
         " Table 2. Below: laser minus the ball bar's line."
     )
-    return Picture(caption, (comparison_plot(data, key="yang-dxx", heading="δxx: laser against ball bar"),), "wide")
+    return PictureBlock(caption, (comparison_plot(data, key="yang-dxx", heading="δxx: laser against ball bar"),), "wide")

@@ -9,9 +9,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from abbe.service.domain.finding import RunFit
+from abbe.service.domain.finding import RunResidual
 from abbe.service.rendering.axes import Panel, bar_panel, data_range
-from abbe.service.rendering.model import PlaceMap, Trace
+from abbe.service.rendering.model import PlaceMap, ResidualTrace
 from abbe.service.rendering.numbers import COVERAGE, plain
 from abbe.service.rendering.svg import Svg
 
@@ -23,7 +23,7 @@ STEPS = (1.5, 2.5, 4.0, 7.0)
 """Limits between the five colours of a cell: rms of the gap divided by the noise."""
 
 
-def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
+def gap_bars(runs: Mapping[str, RunResidual], *, key: str = "gap") -> str:
     """One row per run: gap before (upper bar) and after (lower bar), and the noise floor as a tick. Sealed runs are left out."""
     rows = [
         (label, r, r.rms_before_um, r.rms_after_um)
@@ -49,7 +49,7 @@ def gap_bars(runs: Mapping[str, RunFit], *, key: str = "gap") -> str:
     return svg.render()
 
 
-def trace_plot(trace: Trace, *, key: str) -> str:
+def trace_plot(trace: ResidualTrace, *, key: str) -> str:
     """Two panels with one scale: measured minus simulated before, and after. Band: two standard deviations of the noise."""
     size = np.abs(np.concatenate([trace.before_um, trace.after_um, [1.3 * COVERAGE * trace.noise_um]]))
     top = float(size[np.isfinite(size)].max()) * 1.06 or 1.0

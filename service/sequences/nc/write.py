@@ -214,7 +214,7 @@ def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, se
     settings = settings or NcSettings()
     arcs = ("XY",) if dialect == "heidenhain" else PLANES  # heidenhain: arcs (C) lie in the plane normal to the tool axis Z of TOOL CALL
     made = program(name, plan, machine.stroke_mm, arcs)
-    pace = Pace(settings.acceleration_mm_s2)
+    pace = PathDynamics(settings.acceleration_mm_s2)
     took = runtime(made.blocks, pace)
     made = replace(made, head=(*made.head, *_runtime_comments(took, pace)))
     text = heidenhain(made, settings.heidenhain_tool) if dialect == "heidenhain" else gcode(made, DIALECTS[dialect])
@@ -228,7 +228,7 @@ def nc_program(name: str, machine: Machine, plan: CampaignPlan, dialect: str, se
 
 
 @dataclass(frozen=True, slots=True)
-class Pace:
+class PathDynamics:
     """Assumptions about a controller: acceleration along the path, and the time of an exact stop until the axes are in position."""
 
     acceleration_mm_s2: float = 500.0
@@ -249,7 +249,7 @@ class Runtime:
         return self.moving_s + self.resting_s
 
 
-def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
+def runtime(blocks: tuple[Block, ...], pace: PathDynamics) -> Runtime:
     """Return the time of all blocks: each line or arc from standstill to standstill; moves without a stop between them count as one."""
     moving, resting, here = 0.0, 0.0, None
     smooth, run_mm, run_feed = False, 0.0, 0.0
@@ -270,7 +270,7 @@ def runtime(blocks: tuple[Block, ...], pace: Pace) -> Runtime:
     return Runtime(moving + (one_move_s(run_mm, run_feed, pace) if run_mm else 0.0), resting)
 
 
-def one_move_s(way_mm: float, feed_mm_min: float, pace: Pace) -> float:
+def one_move_s(way_mm: float, feed_mm_min: float, pace: PathDynamics) -> float:
     """Return the time in s from standstill to standstill: accelerate, run at the feed if the length allows it, brake, stop exactly."""
     if way_mm <= 0.0:
         return 0.0
@@ -293,7 +293,7 @@ def _minutes(made: Program, took: Runtime) -> str:
     return f"about {math.ceil(took.total_s / 60.0)} min without the {made.halts} stops for a person"
 
 
-def _runtime_comments(took: Runtime, pace: Pace) -> tuple[str, str]:
+def _runtime_comments(took: Runtime, pace: PathDynamics) -> tuple[str, str]:
     """Return comments with the run time, rounded up: the operator should wait less than announced, not longer."""
     return (
         f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"

@@ -87,7 +87,7 @@ def insert_missing_tables(connection: Connection, machine_id: int, images: Mappi
         connection.execute(comp_tables.insert().values(row))
 
 
-class Tables(Repository):
+class CompensationTables(Repository):
     """Compensation tables."""
 
     def add(self, machine_id: int, solution_id: int | None, image: bytes, crc: int, doc: Doc) -> int:

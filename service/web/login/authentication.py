@@ -13,7 +13,7 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.storage.store import Store
 from abbe.service.users.lockout import Buckets, Lockout
-from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, People, Principal
+from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, Principal, UserAccounts
 
 COOKIE = "abbe"
 
@@ -47,7 +47,7 @@ class Authenticator:
     def __init__(
         self,
         store: Store,
-        people: People,
+        people: UserAccounts,
         book: AuditBook,
         endpoint: Endpoint = DEFAULT_ENDPOINT,
         *,
@@ -73,7 +73,7 @@ class Authenticator:
     async def who(self, bearer: str | None, secret: str | None, *, in_use: bool = True, to_stop: bool = False) -> Principal:
         """Identify the visitor by token, else by cookie; an onlooker while there are no users.
 
-        ``in_use`` False: an automatic refresh, which does not extend the session; ``to_stop``: see `People.by_session`.
+        ``in_use`` False: an automatic refresh, which does not extend the session; ``to_stop``: see `UserAccounts.by_session`.
         """
         return await asyncio.to_thread(self._who, bearer, secret, in_use, to_stop)
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from markupsafe import Markup
 
-from abbe.models.uncertainty.what_if import Forecast, check_figures, what_if
+from abbe.models.uncertainty.what_if import GainForecast, check_figures, what_if
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.errors import AbbeError
 from abbe.service.identification.solution_field import StoredField, stored_field
@@ -96,7 +96,7 @@ def whatif_screen(store: Store, record: SolutionRecord, take: Sequence[str], eve
     return WhatIfScreen(record.id, campaign, means, motions, everything, screen.lines, _picture(outcomes, translate))
 
 
-def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[Forecast]:
+def forecast(stored: StoredField, take: Sequence[str], *, everything: bool = False) -> list[GainForecast]:
     """Figures of the volume and of the builtin check, before and after the errors in ``take`` (or all) are corrected."""
     known = stored.known
     centre, radius = hemisphere(known.machine, CHECK_PLACE, CHECK_SHARE)
@@ -135,7 +135,7 @@ def _refusal(choices: Sequence[EffectChoice], take: Sequence[str], translate: Tr
     return translate("whatif.twice", names=", ".join(twice)) if twice else ""
 
 
-def _line(o: Forecast, translate: Translate) -> ForecastLine:
+def _line(o: GainForecast, translate: Translate) -> ForecastLine:
     pairs = [(o.before_mm, o.u_before_mm), (o.after_mm, o.u_after_mm), (o.gain_mm, max(o.u_gain_mm, RESOLUTION_MM))]
     before, after, gain = (current().with_u(v * UM, u * UM) for v, u in pairs)
     if o.u_gain_mm < RESOLUTION_MM:  # removing a given scale shifts a range equally in every draw: the rest is rounding
@@ -144,12 +144,12 @@ def _line(o: Forecast, translate: Translate) -> ForecastLine:
     return ForecastLine(_name(o, translate), before, after, gain, "unsure" if not sure else "better" if o.gain_mm > 0.0 else "worse")
 
 
-def _name(o: Forecast, translate: Translate) -> str:
+def _name(o: GainForecast, translate: Translate) -> str:
     stem, _, rest = o.name.partition("_")
     return translate("figure.diagonal", name=rest) if stem == "diagonal" else translate(f"whatif.{o.name}")
 
 
-def _picture(outcomes: Sequence[Forecast], translate: Translate) -> Markup:
+def _picture(outcomes: Sequence[GainForecast], translate: Translate) -> Markup:
     pairs = [Pair(_name(o, translate), (o.before_mm * UM, o.u_before_mm * UM), (o.after_mm * UM, o.u_after_mm * UM)) for o in outcomes]
     names = (translate("whatif.before"), translate("whatif.after"))
     # The SVG writer has already escaped every text.

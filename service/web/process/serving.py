@@ -21,7 +21,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
-from abbe.service.users.people import People
+from abbe.service.users.people import UserAccounts
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
@@ -133,7 +133,7 @@ async def _begin(wire: Wire) -> Begin | None:
 
 async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socket) -> int:
     clock = SystemClock()
-    people = People(store, clock)
+    people = UserAccounts(store, clock)
     people.passwords.prepare()
     core = CoreLine(wire, clock)
     reader = Reader(store, begin.machine, clock, begin.control)

@@ -11,7 +11,7 @@ import pytest
 
 from abbe.drivers.conformance.checks import Move
 from abbe.drivers.conformance.device_test import Options, device_test, summary
-from abbe.drivers.described.tested import Ability, TestReport, Verdict
+from abbe.drivers.described.tested import Ability, CheckVerdict, TestReport
 from abbe.drivers.errors import NotProved
 from abbe.drivers.registry import open_laser
 from tests.drivers.described.foreign import FILE, World
@@ -109,7 +109,7 @@ async def test_what_is_wrong_is_named(
     wrong = url.replace(str(FILE), str(changed(tmp_path, *changes, limits)))
     report = await report_of(wrong, world)
     found = verdict(report, check)
-    assert found[0] == Verdict.FAILED
+    assert found[0] == CheckVerdict.FAILED
     assert why in found[1]
     assert report.abilities == ()
     with pytest.raises(NotProved, match="its test did not prove it"):

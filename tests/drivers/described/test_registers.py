@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.drivers.described.registers import ORDERS, decode, encode, ours
-from abbe.drivers.device_file import SIZE, Value
+from abbe.drivers.device_file import SIZE, DeviceValue
 
 # As manuals of devices show them: 0x12345678, the float 1234.5 (0x449A5000), and the 64-bit 0x0102030405060708.
 KNOWN = [
@@ -55,6 +55,6 @@ def test_a_number_that_does_not_fit_is_refused(kind, number):
     ],
 )
 def test_units(unit, count, expected):
-    assert ours(Value(unit=unit), count) == pytest.approx(expected)
-    assert ours(Value(unit=unit, sign=-1, offset=0.0, scale=0.5), -2.0 * count) == pytest.approx(expected)
-    assert math.isnan(ours(Value(unit=unit), float("nan")))
+    assert ours(DeviceValue(unit=unit), count) == pytest.approx(expected)
+    assert ours(DeviceValue(unit=unit, sign=-1, offset=0.0, scale=0.5), -2.0 * count) == pytest.approx(expected)
+    assert math.isnan(ours(DeviceValue(unit=unit), float("nan")))

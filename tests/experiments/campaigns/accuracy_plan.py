@@ -7,7 +7,7 @@ import numpy as np
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
 from abbe.models.planning.measurements import HelixTest, helix_path
-from abbe.models.planning.plan import Plan, PlanStep, plan_campaign
+from abbe.models.planning.plan import MeasuringPlan, PlanStep, plan_campaign
 from abbe.models.solvers.observations import RunData, block_average
 from abbe.simulators.campaign.sampler import Conditions, Rig
 from tests.experiments.campaigns.population import BLOCKS, Case, draw_machine
@@ -22,7 +22,7 @@ def planned_case(seed: int, minutes: float, conditions: Conditions) -> Case:
     return Case(seed, "joint", machine, measured(rig, machine, plan), Truth(rig), (machine.tool_mm,))
 
 
-def measured(rig: Rig, machine: Machine, plan: Plan) -> tuple[RunData, ...]:
+def measured(rig: Rig, machine: Machine, plan: MeasuringPlan) -> tuple[RunData, ...]:
     """Readings of all runs of a plan, bars in block averages as the product takes them."""
     cups: dict[str, np.ndarray] = {}
     mounts: dict[str, dict] = {}

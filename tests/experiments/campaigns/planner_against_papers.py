@@ -21,7 +21,7 @@ from abbe.models.paths import DIAGONALS
 from abbe.models.planning.measurements import BAR_CLEARANCE_MM, DiagonalTest, HelixTest, Instruments, candidates
 from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, REPORT_NODES, plan_campaign, uncertainty_mm
 from abbe.models.planning.problem import field_rows, problem
-from abbe.models.planning.search import Chosen, Search
+from abbe.models.planning.search import Chosen, PlanSearch
 from abbe.models.uncertainty.inputs import StatedInputs
 
 STROKES = ((600.0, 500.0, 450.0), (812.8, 495.0, 508.0), (1000.0, 600.0, 500.0), (400.0, 400.0, 300.0), (1500.0, 800.0, 700.0))
@@ -89,7 +89,7 @@ def paper_campaign(machine: Machine, name: str) -> Chosen:
 
 def compare(machine: Machine, name: str) -> Comparison:
     """One paper's campaign against the planner's on one machine."""
-    paper = Search(problem(machine, replace(TOOLS, bar_lengths_mm=paper_bars(machine)), PLAN_ORDER), (), INNER_SHARE)
+    paper = PlanSearch(problem(machine, replace(TOOLS, bar_lengths_mm=paper_bars(machine)), PLAN_ORDER), (), INNER_SHARE)
     chosen = paper_campaign(machine, name)
     minutes = paper.total_min(chosen)
     theirs = uncertainty_mm(paper.information(chosen), field_rows(paper.what, INNER_SHARE, REPORT_NODES))[0]
@@ -101,7 +101,7 @@ def compare(machine: Machine, name: str) -> Comparison:
 
 def best_mounting(machine: Machine, minutes: float) -> float:
     """Smallest worst-point uncertainty of all mountings that fit into the minutes, with up to three tests each, um: tried one by one."""
-    search = Search(problem(machine, TOOLS, PLAN_ORDER), candidates(machine, TOOLS), INNER_SHARE)
+    search = PlanSearch(problem(machine, TOOLS, PLAN_ORDER), candidates(machine, TOOLS), INNER_SHARE)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     layer: list[Chosen] = [{t.mounting: (t,)} for t in search.candidates if search.cost_min(t, ()) <= minutes]
     found = []
@@ -111,7 +111,7 @@ def best_mounting(machine: Machine, minutes: float) -> float:
     return min(found)
 
 
-def _more(search: Search, chosen: Chosen, minutes: float) -> list[Chosen]:
+def _more(search: PlanSearch, chosen: Chosen, minutes: float) -> list[Chosen]:
     name, tests = next(iter(chosen.items()))
     left = minutes - search.total_min(chosen)
     ranked = search.ranking(chosen, left, tuple(t for t in search.candidates if t.mounting == name))

@@ -21,7 +21,7 @@ from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
@@ -164,7 +164,7 @@ async def test_the_end_stops_a_job_by_hand(bench: Bench) -> None:
 
 def test_rights_are_those_of_the_role_today(tmp_path: Path) -> None:
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        people = People(store, FakeClock(NOON), Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, FakeClock(NOON), Passwords(memory_kib=64, passes=1))
         for role in Role:
             people.add(f"a-{role}", role, "correct horse battery staple")
             for who in (f"user:a-{role}", f"token:a-{role}/ci"):

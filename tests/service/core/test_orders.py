@@ -29,7 +29,7 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.users.roles import Permission, Role
 from tests.patience import within
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
@@ -224,7 +224,7 @@ async def test_a_service_without_a_controller_takes_no_order(bench: Bench) -> No
 
 def test_who_may_is_who_may_approve_today(tmp_path: Path) -> None:
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
-        people = People(store, FakeClock(utc(2026, 6, 1, 12)), Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, FakeClock(utc(2026, 6, 1, 12)), Passwords(memory_kib=64, passes=1))
         for role in Role:
             people.add(f"a-{role}", role, "correct horse battery staple")
             assert may(store, f"user:a-{role}", Permission.APPROVE) == (role == Role.APPROVER)

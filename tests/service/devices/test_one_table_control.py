@@ -27,7 +27,7 @@ from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import DoorOpen, PushNotBegun, StillActive, TableMismatch, TableRefused
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
@@ -77,11 +77,11 @@ def tables() -> NineTables:
 
 
 async def push(session: Session, store: Store, site: Site, *, better: bool):
-    async def probe() -> Verdict:
-        return Verdict(True, "as predicted")
+    async def probe() -> VerificationResult:
+        return VerificationResult(True, "as predicted")
 
-    async def verify() -> Verdict:
-        return Verdict(better, "better" if better else "not better")
+    async def verify() -> VerificationResult:
+        return VerificationResult(better, "better" if better else "not better")
 
     wanted = WantedTable(tables(), await read_base(session.controller), 100, None, {})
     return await Pushing(session.controller, store, site).bring(wanted, Questions(list, "a test", probe, verify))
@@ -145,7 +145,7 @@ async def test_a_line_that_breaks_while_tables_are_exchanged(control, store, sit
         old = (await read_base(session.controller)).image
         number = control.number
 
-        async def probe() -> Verdict:
+        async def probe() -> VerificationResult:
             raise AssertionError("nothing is measured")
 
         wanted = WantedTable(tables(), await read_base(session.controller), 100, None, {})

@@ -19,7 +19,7 @@ from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.config import load_machine
 from abbe.service.devices.session import Session, open_session
 from abbe.service.errors import ConfigError, DoorOpen
-from abbe.service.push.operations import Verdict
+from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Control, check_interlocks
 from abbe.service.sequences.paths import follow_path
 from abbe.service.sequences.steps import FollowPath
@@ -110,9 +110,9 @@ async def test_a_table_is_pushed_into_it(session: Session, control: AcmeControl,
     tables = NineTables(grid, curves, tuple(np.zeros((5, 3)) for _ in range(3)))
     measured: list[str] = []
 
-    async def good() -> Verdict:
+    async def good() -> VerificationResult:
         measured.append("looked")
-        return Verdict(True, "as predicted")
+        return VerificationResult(True, "as predicted")
 
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         await as_if_commissioned(session.controller, store, site)

@@ -10,7 +10,7 @@ import pytest
 
 from abbe.models.discovery.answer import Localization
 from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
-from abbe.service.discovery.discover_live import Addition, find_addition
+from abbe.service.discovery.discover_live import LiveAddition, find_addition
 from abbe.service.discovery.experiment_recipes import next_plan
 from abbe.service.domain.measured import Owner
 from abbe.service.runs.cases import case_of
@@ -63,7 +63,7 @@ class Played:
             self.store.runs.finish(number, "complete", "", {})
 
     def left(self) -> tuple[TestPlan, ...]:
-        found: Addition = find_addition(self.store, self.june, repeats())
+        found: LiveAddition = find_addition(self.store, self.june, repeats())
         return () if found.remaining is None else found.remaining.tests
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from abbe.service.rendering.document import Document, Lines, Picture, Section
+from abbe.service.rendering.document import Document, Lines, PictureBlock, Section
 from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, PolarTrace, ResidualSeries, TableCurve
 from abbe.service.rendering.plots import diagonal_plot, polar_plot, table_plot, volume_pair
 from abbe.service.report.blocks import (
@@ -107,9 +107,9 @@ def full_report() -> Document:
         ]
     )
     log = ["03:38:02 lease taken", "03:38:05 bank 1 written and read back, equal", "03:38:06 activated", "03:39:51 verified"]
-    before = [summary_table(SUMMARY), Picture("Error vectors.", vectors), Picture("Body diagonals.", [diagonals], "wide")]
+    before = [summary_table(SUMMARY), PictureBlock("Error vectors.", vectors), PictureBlock("Body diagonals.", [diagonals], "wide")]
     machine = [p for p in PARAMETERS if p.note != "set-up"]
-    parameters = [*parameter_pictures(PARAMETERS, RANKED), Picture("Circle.", [circle])]
+    parameters = [*parameter_pictures(PARAMETERS, RANKED), PictureBlock("Circle.", [circle])]
     return Document(
         kind="cycle",
         title="Worn VMC: measured, corrected, verified",
@@ -122,7 +122,7 @@ def full_report() -> Document:
         ],
         not_observable=["EAZ together with tool offset: both tests use one tool length."],
         appendix=[
-            Section("Compensation tables", [Picture("Tables.", [table_plot(tables, lsb_um=0.1)], "wide"), Lines(log, numbered=True)]),
+            Section("Compensation tables", [PictureBlock("Tables.", [table_plot(tables, lsb_um=0.1)], "wide"), Lines(log, numbered=True)]),
             Section("Residuals", residual_picture(residuals, RUNS)),
             Section("Runs", [run_table(RUNS)]),
         ],

@@ -9,7 +9,7 @@ import numpy as np
 import pypdf
 import pytest
 
-from abbe.service.rendering.document import DECISION_RULE, Document, Instrument, Picture, ReportFigure, Section, TextTable
+from abbe.service.rendering.document import DECISION_RULE, Document, Instrument, PictureBlock, ReportFigure, Section, TextTable
 from abbe.service.rendering.document_data import document_csv, document_json
 from abbe.service.rendering.document_page import document_html, document_pdf, standalone
 from abbe.service.rendering.model import PolarTrace
@@ -49,7 +49,7 @@ def test_hostile_words_stay_words_on_page_and_paper():
 
 
 def test_the_pdf_brings_its_own_fonts_has_tags_no_date_and_no_link():
-    reader = pypdf.PdfReader(io.BytesIO(document_pdf(document(appendix=[Section("P", [Picture("circle", [polar()])])]))))
+    reader = pypdf.PdfReader(io.BytesIO(document_pdf(document(appendix=[Section("P", [PictureBlock("circle", [polar()])])]))))
     fonts = {str(f["/BaseFont"]).split("+")[-1] for p in reader.pages for f in (v.get_object() for v in p["/Resources"]["/Font"].values())}
     assert fonts
     assert all(f.startswith("Libertinus") for f in fonts)

@@ -9,7 +9,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 
-from abbe.service.rendering.document import Document, Facts, Instrument, Lines, Picture, ReportFigure, Section, TextTable
+from abbe.service.rendering.document import Document, Facts, Instrument, Lines, PictureBlock, ReportFigure, Section, TextTable
 from abbe.service.rendering.document_page import document_html
 from abbe.service.rendering.model import ArrowField, Contribution, ParameterRow, PolarTrace, ResidualSeries, TableCurve
 from abbe.service.rendering.plots import contribution_bars, diagonal_plot, polar_plot, table_plot, volume_pair
@@ -135,8 +135,8 @@ def test_hostile_words_stay_words(minimal_report: Document) -> None:
     pictures = [
         *parameter_pictures([ParameterRow(HOSTILE, 1.0, 0.1, HOSTILE)], [Contribution(HOSTILE, 1.0, 0.1)]),
         *residual_picture([ResidualSeries(HOSTILE, HOSTILE, x, x)], [RunRow(HOSTILE, HOSTILE, HOSTILE, 1, 1.0, 1.0)]),
-        Picture(HOSTILE, [table_plot([TableCurve(HOSTILE, HOSTILE, x, x)]), diagonal_plot({HOSTILE: (x, x)}, {})], "wide"),
-        Picture(HOSTILE, [polar_plot([PolarTrace(HOSTILE, x, x)])]),
+        PictureBlock(HOSTILE, [table_plot([TableCurve(HOSTILE, HOSTILE, x, x)]), diagonal_plot({HOSTILE: (x, x)}, {})], "wide"),
+        PictureBlock(HOSTILE, [polar_plot([PolarTrace(HOSTILE, x, x)])]),
     ]
     words = [HOSTILE, Lines([HOSTILE]), Facts({HOSTILE: HOSTILE}), TextTable((HOSTILE, HOSTILE), [(HOSTILE, HOSTILE)])]
     report = dataclasses.replace(
@@ -190,7 +190,7 @@ def test_missing_numbers_are_named_not_drawn(minimal_report: Document) -> None:
         ReportFigure("g", "b", "not known", 1.0, inf, "µm"),
         ReportFigure("g", "c", "none", None, None, ""),
     ]
-    report = dataclasses.replace(minimal_report, sections=[Section("s", [*blocks, Picture("c", pictures)])], figures=figures)
+    report = dataclasses.replace(minimal_report, sections=[Section("s", [*blocks, PictureBlock("c", pictures)])], figures=figures)
     page = document_html(report)
     Outline(page)
     assert "n/a" in page

@@ -10,7 +10,7 @@ import pytest
 from abbe.models.machine import Machine
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.nc.blocks import Arc, Dwell, Go, Smooth
-from abbe.service.sequences.nc.write import NAMES, NcSettings, Pace, nc_program, one_move_s, runtime
+from abbe.service.sequences.nc.write import NAMES, NcSettings, PathDynamics, nc_program, one_move_s, runtime
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import (
@@ -167,7 +167,7 @@ def test_the_head_says_how_long_it_runs_and_what_was_taken_for_granted(plan):
 
 
 def test_a_move_takes_its_way_at_feed_and_its_speeding_up():
-    pace = Pace(500.0, 0.1)
+    pace = PathDynamics(500.0, 0.1)
     assert one_move_s(600.0, 6000.0, pace) == pytest.approx(6.0 + 0.2 + 0.1)  # 100 mm/s; 0.2 s at either end at half of it
     assert one_move_s(5.0, 6000.0, pace) == pytest.approx(2 * 0.1 + 0.1)  # never gets to 100 mm/s
     assert one_move_s(0.0, 6000.0, pace) == 0.0

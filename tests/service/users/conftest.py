@@ -11,7 +11,7 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.storage.store import Store
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 
 PHRASE = "correct horse battery staple"
 
@@ -38,7 +38,7 @@ class World:
     store: Store
     url: str
     clock: Turned
-    people: People
+    people: UserAccounts
     book: AuditBook
 
 
@@ -46,4 +46,4 @@ class World:
 def world(tmp_path: Path) -> Iterator[World]:
     clock, url = Turned(), f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
     with Store.open(url, utcnow=clock.utc) as store:
-        yield World(store, url, clock, People(store, clock, Passwords(memory_kib=64, passes=1)), AuditBook(store, url))
+        yield World(store, url, clock, UserAccounts(store, clock, Passwords(memory_kib=64, passes=1)), AuditBook(store, url))

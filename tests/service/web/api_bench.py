@@ -35,7 +35,7 @@ from abbe.service.runs.columns import BAR_CODEC, JSON_CODEC, encode_bar, encode_
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
@@ -78,7 +78,7 @@ class Plant:
     store: Store
     url: str
     clock: Hour
-    people: People
+    people: UserAccounts
     book: AuditBook
     app: FastAPI
     auth: Authenticator
@@ -206,7 +206,7 @@ def open_plant(factory: pytest.TempPathFactory) -> Iterator[Plant]:
 
 
 def _plant(store: Store, url: str, clock: Hour, approvable: list[int]) -> Plant:
-    people = People(store, clock, Passwords(memory_kib=64, passes=1))
+    people = UserAccounts(store, clock, Passwords(memory_kib=64, passes=1))
     for role in Role:
         people.add(f"a-{role}", role, PHRASE)
     book = AuditBook(store, url)

@@ -19,7 +19,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.storage.store import Store
-from abbe.service.users.people import Passwords, People
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
@@ -39,7 +39,7 @@ def url(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[str]:
 async def test_every_text_of_every_query(url: str) -> None:
     clock = SystemClock()
     with Store.open(url) as store:
-        people = People(store, clock, Passwords(memory_kib=64, passes=1))
+        people = UserAccounts(store, clock, Passwords(memory_kib=64, passes=1))
         people.add("adam", "admin", PHRASE)
         auth = Authenticator(store, people, AuditBook(store, url), rate_hz=1e9, burst=1e9)
         board = Board({}, clock)

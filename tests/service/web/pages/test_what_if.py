@@ -17,7 +17,15 @@ from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns, predict
 from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
-from abbe.models.uncertainty.what_if import Forecast, check_figures, diagonal_figures, expected_rms, helix_figure, volume_figures, what_if
+from abbe.models.uncertainty.what_if import (
+    GainForecast,
+    check_figures,
+    diagonal_figures,
+    expected_rms,
+    helix_figure,
+    volume_figures,
+    what_if,
+)
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
 from abbe.service.domain.solution_file import StoredPrediction
@@ -164,7 +172,7 @@ def test_what_is_corrected_leaves_its_uncertainty(known) -> None:
         assert after.before_mm == before.before_mm  # the same draws
     d = known.per_unit(volume_grid(known.machine.stroke_mm, 6))
     unknown = np.sqrt(np.einsum("mik,kl,mil->", d, known.covariance, d, optimize=True) / len(d))
-    rms: Forecast = all_of_it[0]
+    rms: GainForecast = all_of_it[0]
     assert np.hypot(rms.after_mm, rms.u_after_mm) == pytest.approx(unknown, rel=0.05)
 
 
