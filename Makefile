@@ -44,11 +44,12 @@ fmt: $(DEV_READY) ## sort imports and format
 	$(BIN)/ruff check --fix-only --quiet
 	$(BIN)/ruff format
 
-docs: $(DEV_READY) ## write the pages of docs/ that come from the code: commands, machine file, error codes, formats, faults, decisions, schemas
+docs: $(DEV_READY) ## write the pages of docs/ that come from the code: commands, Python, machine file, error codes, formats, faults, decisions, schemas
 	@$(BIN)/python -m tests.project.cli_page
 	@$(BIN)/python -m tests.project.machine_file_page
 	@$(BIN)/python -m tests.project.device_file_page
 	@$(BIN)/python -m tests.project.decisions_page
+	@$(BIN)/python -m tests.project.python_page
 	@$(BIN)/python -m tests.service.formats.page
 	@$(BIN)/python -m tests.faults.page
 	@$(BIN)/python -m abbe.service.web.catalogue > docs/reference/error-codes.md

@@ -6,7 +6,7 @@ angles in rad, times in s, unless a name says otherwise. The subpackages are lin
     campaign = abbe.read_campaign("june/")
     solution = abbe.solve(campaign)
     answer = abbe.discover(campaign)
-    runs = abbe.simulate(machine, plan, errors)
+    runs = abbe.simulate(machine, abbe.plan(machine).campaign, errors)
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from abbe.models.compensation.tables import NineTables as NineTables
+    from abbe.models.effects import columns as columns
     from abbe.models.effects.effect import Effect as Effect
     from abbe.models.effects.effect import Form as Form
     from abbe.models.effects.effect import Parameter as Parameter
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
     from abbe.public.discovery import discover as discover
     from abbe.public.estimates import Estimate as Estimate
     from abbe.public.picture import Picture as Picture
+    from abbe.public.planning import Plan as Plan
+    from abbe.public.planning import plan as plan
     from abbe.public.simulation import SimulatedInstruments as SimulatedInstruments
     from abbe.public.simulation import simulate as simulate
     from abbe.public.solution import Deviation as Deviation
@@ -69,13 +72,16 @@ _WHERE = {
     "Parameter": "abbe.models.effects.effect",
     "Path": "abbe.models.effects.path",
     "Picture": "abbe.public.picture",
+    "Plan": "abbe.public.planning",
     "Places": "abbe.models.effects.path",
     "Polynomial": "abbe.models.functions.polynomial",
     "Solution": "abbe.public.solution",
     "Table": "abbe.models.functions.table",
+    "columns": "abbe.models.effects.columns",
     "discover": "abbe.public.discovery",
     "discovery_campaign": "abbe.service.sequences.recipes.campaigns",
     "identification": "abbe.service.sequences.recipes.campaigns",
+    "plan": "abbe.public.planning",
     "read_campaign": "abbe.public.campaign",
     "read_errors": "abbe.public.campaign",
     "simulate": "abbe.public.simulation",
@@ -90,7 +96,8 @@ __all__ = list(_WHERE)
 def __getattr__(name: str) -> Any:
     if name not in _WHERE:
         raise AttributeError(f"module 'abbe' has no attribute {name!r}")
-    found = getattr(import_module(_WHERE[name]), name)
+    module = import_module(_WHERE[name])
+    found = module if _WHERE[name].endswith(f".{name}") else getattr(module, name)
     globals()[name] = found
     return found
 

@@ -243,18 +243,24 @@ def step_rows(plan: MeasuringPlan) -> list[tuple[str, ...]]:
     return rows
 
 
-def plan_report(site: Site, planned: PlannedCampaign) -> Document:
-    """Return a report with a picture of the set-ups and the gain of each measurement."""
+def plan_picture(site: Site, planned: PlannedCampaign) -> str:
+    """Draw the set-ups of a plan in the volume, as ``<svg>``."""
     plan = planned.plan
     paths = [
         DrawnTest(int(s.setup_id.removeprefix("S")), _kind(s.test), describe(s.test), run.axes_mm, _mount_mm(s.test, run.axes_mm))
         for s, run in zip(plan.steps, plan.runs, strict=True)
     ]
+    return setups_picture(site.machine.stroke_mm, paths)
+
+
+def plan_report(site: Site, planned: PlannedCampaign) -> Document:
+    """Return a report with a picture of the set-ups and the gain of each measurement."""
+    plan = planned.plan
     lead = [f"{site.name}: {plan.minutes:.0f} minutes, set-ups included.", *goal_lines(plan), *planned.notes]
     headings = ("No", "Label", "Measurement", "min", "until min", "worst U µm", "mean U µm")
     picture = PictureBlock(
         "Numbers: set-ups in the order of measuring. Rest the pointer on a dot to read what is set up there.",
-        [setups_picture(site.machine.stroke_mm, paths)],
+        [plan_picture(site, planned)],
         "wide",
     )
     table = TextTable(headings, step_rows(plan))

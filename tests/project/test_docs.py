@@ -14,7 +14,7 @@ import pytest
 
 from abbe.service import cli
 from abbe.service.config import load_machine
-from tests.project import cli_page, decisions_page, device_file_page, machine_file_page
+from tests.project import cli_page, decisions_page, device_file_page, machine_file_page, python_page
 
 ROOT = Path(__file__).parents[2]
 PAGES = ("README.md", "CHANGELOG.md", "deploy/README.md", *sorted(str(p.relative_to(ROOT)) for p in (ROOT / "docs").rglob("*.md")))
@@ -130,7 +130,7 @@ def test_pictures_are_small_and_used() -> None:
     assert max(files.values()) < 150_000
 
 
-@pytest.mark.parametrize("page", [cli_page, machine_file_page, device_file_page, decisions_page], ids=lambda page: page.PAGE.name)
+@pytest.mark.parametrize("page", [cli_page, machine_file_page, device_file_page, decisions_page, python_page], ids=lambda page: page.PAGE.name)
 def test_what_the_code_says_is_current(page: ModuleType) -> None:
     assert page.PAGE.read_text(encoding="utf-8") == page.page(), "run make docs"
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
-import textwrap
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -90,11 +90,11 @@ def test_a_broken_one_is_left_out_with_one_error_and_the_others_stay(site: Path,
     assert why in str(fault)
 
 
-def test_the_page_that_explains_it_tells_the_truth(site: Path) -> None:
-    page = (Path(__file__).parents[3] / "docs" / "how-to" / "own-effect.md").read_text()
-    blocks = textwrap.dedent(page.split("## 1.")[1].split("| field |")[0].split("conventions.md)):")[1])
-    distribute(site, "shop_clamp", blocks)
-    assert "shop_clamp:EFFECT" in page
+def test_the_notebook_that_explains_it_is_a_module_as_its_page_says(site: Path) -> None:
+    docs = Path(__file__).parents[3] / "docs"
+    cells = json.loads((docs / "notebooks" / "own-effect.ipynb").read_text(encoding="utf-8"))["cells"]
+    distribute(site, "shop_clamp", "".join(next(cell for cell in cells if cell["cell_type"] == "code")["source"]))
+    assert "shop_clamp:EFFECT" in (docs / "how-to" / "own-effect.md").read_text(encoding="utf-8")
     assert [e.name for e in found().effects] == ["clamp_step"]
 
 
