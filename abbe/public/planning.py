@@ -27,6 +27,8 @@ class Plan:
     ----------
     campaign : CampaignPlan
         What would be measured, in order: for `simulate`.
+    U_mm : float
+        Expected worst expanded uncertainty (k = 2) of the deviation in the inner 80 % of the volume: a lower bound of that of `solve`.
     steps : tuple of (str, float, float)
         Each measurement in words, minutes until it is done, and expected worst U (k = 2) of the deviation afterwards, mm.
     not_observable : tuple of str
@@ -34,6 +36,7 @@ class Plan:
     """
 
     campaign: CampaignPlan
+    U_mm: float
     steps: tuple[tuple[str, float, float], ...]
     not_observable: tuple[str, ...]
     _site: Site
@@ -43,11 +46,6 @@ class Plan:
     def minutes(self) -> float:
         """Time of the whole plan, set-ups included."""
         return self._planned.plan.minutes
-
-    @property
-    def U_mm(self) -> float:
-        """Expected worst expanded uncertainty (k = 2) of the deviation in the inner 80 % of the volume, mm: a lower bound of `solve`'s."""
-        return COVERAGE * self._planned.plan.u_worst_mm
 
     def plot(self) -> Picture:
         """Draw the set-ups in the volume."""
@@ -108,4 +106,4 @@ def plan(
     goal_um = None if goal_mm is None else goal_mm * 1e3
     planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=progress)
     steps = tuple((describe(s.test), s.until_min, COVERAGE * s.u_worst_mm) for s in planned.plan.steps)
-    return Plan(planned.campaign, steps, tuple(planned.plan.open_questions), site, planned)
+    return Plan(planned.campaign, COVERAGE * planned.plan.u_worst_mm, steps, tuple(planned.plan.open_questions), site, planned)

@@ -42,14 +42,12 @@ def entry(name: str) -> str:
     thing = getattr(abbe, name)
     call = f"abbe.{name}" + ("" if isinstance(thing, ModuleType) else _signature(thing))
     members = "".join(f"- `{head}`: {_summary(one)}\n" for head, one in _members(thing))
-    return f"\n### {name}\n\n```python\n{call}\n```\n\n{_markdown(inspect.getdoc(thing) or '')}\n" + (f"\n{members}" if members else "")
+    return f"\n### {name}\n\n    {call}\n\n{_markdown(inspect.getdoc(thing) or '')}\n" + (f"\n{members}" if members else "")
 
 
 def _signature(thing: Any) -> str:
-    if inspect.isclass(thing) and (
-        issubclass(thing, Exception) or any(name.startswith("_") for name in inspect.signature(thing).parameters)
-    ):
-        return ""  # made by a function of this page, or raised
+    if inspect.isclass(thing) and (issubclass(thing, Exception) or "esult of `" in (inspect.getdoc(thing) or "")):
+        return ""  # raised, or made by a function of this page
     parts, star = [], False
     for one in inspect.signature(thing).parameters.values():
         if one.kind is one.KEYWORD_ONLY and not star:

@@ -130,7 +130,10 @@ def test_pictures_are_small_and_used() -> None:
     assert max(files.values()) < 150_000
 
 
-@pytest.mark.parametrize("page", [cli_page, machine_file_page, device_file_page, decisions_page, python_page], ids=lambda page: page.PAGE.name)
+WRITTEN = [cli_page, machine_file_page, device_file_page, decisions_page, python_page]
+
+
+@pytest.mark.parametrize("page", WRITTEN, ids=lambda page: page.PAGE.name)
 def test_what_the_code_says_is_current(page: ModuleType) -> None:
     assert page.PAGE.read_text(encoding="utf-8") == page.page(), "run make docs"
 

@@ -50,7 +50,8 @@ def test_it_runs_beside_a_foreign_models_py(name: str, tmp_path: Path) -> None:
 
 def test_the_planned_recipe_is_written_as_the_notebook_says(tmp_path: Path) -> None:
     """A short plan keeps this quick."""
-    lines = code("plan")[0].replace("minutes=40", "minutes=8").splitlines()[:4] + ["plan.save('f.toml')", "print(plan, plan.plot().svg[:4])"]
+    made = code("plan")[0].replace("minutes=40", "minutes=8").splitlines()[:4]
+    lines = [*made, "plan.save('f.toml')", "print(plan, plan.plot().svg[:4])"]
     ran = subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
     assert re.fullmatch(r"<abbe.Plan: \d+ measurements, \d min, U = .* µm> <svg\n", ran.stdout)
