@@ -14,7 +14,7 @@ from collections.abc import AsyncIterator, Sequence
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 from enum import Flag, IntFlag, StrEnum, auto
-from typing import NamedTuple, Protocol
+from typing import NamedTuple, Protocol, TypeGuard
 
 Point = tuple[float, float, float]
 
@@ -153,6 +153,22 @@ class ControllerStatus:
         return Condition.REMOTE in self.conditions
 
 
+@dataclass(frozen=True, slots=True)
+class ProbeState:
+    """A touch probe: whether it is in the spindle and ready, and whether its stylus is deflected now."""
+
+    fitted: bool
+    deflected: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Latch:
+    """Commanded position at which the probe tripped, and when, microseconds of the controller's clock."""
+
+    position_mm: Point
+    ctrl_us: int
+
+
 class BankState(StrEnum):
     """State of a bank for compensation tables. Drivers map their own numbers to these."""
 
@@ -243,6 +259,13 @@ class Paths(Motion, Protocol):
     async def start_path(self, *, feed_mm_min: float) -> None: ...
 
 
+class Probing(Motion, Protocol):
+    """Moves that a touch probe ends. ``touch``: position at which it tripped, None if it reached the target without a trip."""
+
+    async def probe_state(self) -> ProbeState: ...
+    async def touch(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> Latch | None: ...
+
+
 class Tables(Protocol):
     """Two banks for compensation tables, and the lease that allows changing them.
 
@@ -286,6 +309,11 @@ class Controller(Identity, Paths, Tables, Protocol):
     """All capabilities of a controller. Functions should require only the part that they need."""
 
 
+def can_touch(controller: object) -> TypeGuard[Probing]:
+    """Whether a control can end moves by a touch probe (`Probing`)."""
+    return hasattr(controller, "touch") and hasattr(controller, "probe_state")
+
+
 ONE_BANK = ("table_state", "read_table", "write_table", "switch")
 
 
@@ -312,6 +340,7 @@ class Fixture(Protocol):
     async def take_out_ballbar(self) -> None: ...
     async def change_ballbar(self, radius_mm: float) -> None: ...
     async def mount_laser(self, beam: Point) -> None: ...
+    async def mount_artefact(self, origin_mm: Point, matrix: tuple[Point, Point, Point]) -> None: ...
     async def unmount(self) -> None: ...
     async def close(self) -> None: ...
 

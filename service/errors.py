@@ -224,6 +224,42 @@ class DevicesNotReady(AbbeError):
     code = "SEQ-011"
 
 
+class ProbeFault(MeasurementFault):
+    """The touch probe cannot measure a feature. The stylus was taken out first; earlier features are kept."""
+
+    code = "PRB-000"
+
+
+class ProbeNotReady(ProbeFault):
+    """No touch probe is fitted and ready, or its stylus is deflected before a touch."""
+
+    code = "PRB-001"
+
+
+class MissedContact(ProbeFault):
+    """The probe reached the end of a touch without tripping."""
+
+    code = "PRB-002"
+
+
+class Obstructed(ProbeFault):
+    """The probe tripped twice on a way where nothing should be: the artefact lies otherwise than stated."""
+
+    code = "PRB-003"
+
+
+class FalseTrips(ProbeFault):
+    """The probe trips at places that do not repeat."""
+
+    code = "PRB-004"
+
+
+class ProbeUncalibrated(ProbeFault):
+    """A feature's radius shows that the stylus is not the stated one, or not qualified."""
+
+    code = "PRB-005"
+
+
 class NotObservable(AbbeError):
     """The data do not determine the requested quantity."""
 

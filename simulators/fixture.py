@@ -8,6 +8,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from abbe.simulators.arrays import F
 from abbe.simulators.cnc.log import Command, TableAccess
 from abbe.simulators.scenario import AXES
 from abbe.simulators.world import World
@@ -57,6 +58,7 @@ class Fixture:
             "take_out_ballbar": self._take_out_ballbar,
             "change_ballbar": self._change_ballbar,
             "mount_laser": self._mount_laser,
+            "mount_artefact": self._mount_artefact,
             "unmount": self._unmount,
             "estop": self._estop,
             "door": self._door,
@@ -72,6 +74,8 @@ class Fixture:
             "unplug_ballbar": self._unplug,
             "plug_ballbar": self._plug,
             "ledger": self._ledger,
+            "touches": self._touches,
+            "plate": self._plate,
         }
 
     async def start(self, port: int) -> int:
@@ -152,7 +156,16 @@ class Fixture:
         self._world.laser.mount(direction, self._standing())
         return {}
 
+    async def _mount_artefact(self, request: Answer) -> Answer:
+        self._standing()
+        origin, matrix = _numbers(request, "origin_mm", (3,)), _numbers(request, "matrix", (3, 3))
+        if np.abs(matrix @ matrix.T - np.eye(3)).max() > 1e-6 or np.linalg.det(matrix) < 0.0:
+            raise FixtureError("matrix is not a rotation")
+        self._world.table.mount(origin, matrix, self._world.time_s)
+        return {}
+
     async def _unmount(self, request: Answer) -> Answer:
+        self._world.table.unmount()
         self._world.ballbar.unmount()
         self._world.laser.unmount()
         return {}
@@ -243,6 +256,19 @@ class Fixture:
         self._world.add_scale(AXES.index(axis), _number(request, "um_per_m") * 1e-6)
         return {}
 
+    async def _touches(self, request: Answer) -> Answer:
+        """Let the next touches go wrong: ``false`` trips in the air, ``missed`` contacts."""
+        stylus = self._world.table.stylus
+        stylus.false_trips, stylus.missed = int(request.get("false", 0)), int(request.get("missed", 0))
+        return {"broken": stylus.broken}
+
+    async def _plate(self, request: Answer) -> Answer:
+        """Let the plate slip by ``moved_mm``, or the next mounting be wrong by so many ``quarters`` of a turn."""
+        if "moved_mm" in request:
+            self._world.table.move(_numbers(request, "moved_mm", (3,)))
+        self._world.table.quarters = int(request.get("quarters", self._world.table.quarters))
+        return {}
+
     async def _unplug(self, request: Answer) -> Answer:
         await self._box.unplug()
         return {}
@@ -263,6 +289,16 @@ def _number(request: Answer, key: str) -> float:
     if not _is_number(value):
         raise FixtureError(f"{key}: a number is expected")
     return float(value)  # type: ignore[arg-type]
+
+
+def _numbers(request: Answer, key: str, shape: tuple[int, ...]) -> F:
+    try:
+        found = np.array(request.get(key), dtype=np.float64)
+    except (TypeError, ValueError):
+        found = np.empty(0)
+    if found.shape != shape or not np.isfinite(found).all():
+        raise FixtureError(f"{key}: {' x '.join(map(str, shape))} numbers are expected")
+    return found
 
 
 def _switch(request: Answer, key: str) -> bool:

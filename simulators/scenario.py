@@ -104,6 +104,32 @@ class HiddenConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class ArtefactConfig:
+    """The plate that the fixture can put on the table. ``kind``: ``hole_plate`` or ``ball_plate``; sizes of the random draws beside."""
+
+    kind: str = "hole_plate"
+    columns: int = 5
+    rows: int = 5
+    pitch_mm: float = 45.0
+    radius_mm: float = 10.0
+    form_um: float = 15.0
+    expansion_ppm: float = 11.5
+    drift_um_per_h: float = 0.8
+    clamping_um: float = 0.2
+    u_length_um: float = 0.4
+
+
+@dataclass(frozen=True, slots=True)
+class ProbeConfig:
+    """The touch probe: radius of its ball, mean pre-travel, lobing (amplitude), noise of the trip."""
+
+    radius_mm: float = 3.0
+    pretravel_um: float = 9.0
+    lobing_um: float = 1.0
+    noise_um: float = 0.3
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario:
     """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit.
 
@@ -120,6 +146,8 @@ class Scenario:
     cnc: PortConfig = field(default_factory=PortConfig)
     fixture: PortConfig = field(default_factory=PortConfig)
     hidden: HiddenConfig = field(default_factory=HiddenConfig)
+    artefact: ArtefactConfig = field(default_factory=ArtefactConfig)
+    probe: ProbeConfig = field(default_factory=ProbeConfig)
 
 
 def load(path: Path = DEFAULT_PATH) -> Scenario:
@@ -160,12 +188,21 @@ def check(scenario: Scenario) -> None:
     for name, value, allowed in (
         ("ballbar.transport", scenario.ballbar.transport, ("pty", "tcp")),
         ("laser.transport", scenario.laser.transport, ("tcp", "rtu")),
+        ("artefact.kind", scenario.artefact.kind, ("hole_plate", "ball_plate")),
     ):
         if value not in allowed:
             raise ScenarioError(f"{name}: {value!r} is none of {', '.join(allowed)}")
+    _check_artefact(scenario.artefact, scenario.probe)
     for name in ("ballbar", "laser", "cnc", "fixture"):
         if not 0 <= getattr(scenario, name).port <= 65535:
             raise ScenarioError(f"{name}.port: must be 0..65535")
+
+
+def _check_artefact(plate: ArtefactConfig, probe: ProbeConfig) -> None:
+    if not (1 <= plate.columns <= 26 and 1 <= plate.rows <= 26):
+        raise ScenarioError("artefact.columns, artefact.rows: must be 1..26")
+    if not 0.0 < probe.radius_mm < plate.radius_mm < 0.5 * plate.pitch_mm:
+        raise ScenarioError("artefact.radius_mm: the probe's ball must fit into a hole, and a pitch must hold two features")
 
 
 def parse_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:

@@ -95,7 +95,8 @@ class Site:
         urls["cnc"] = f"modbus+tcp://127.0.0.1:{await self._cnc.start(scenario.cnc.port)}?unit=1"
         urls["fixture"] = f"fixture+tcp://127.0.0.1:{await self._fixture.start(scenario.fixture.port)}"
         self._tick()
-        return {"ready": True, **urls, "speed": scenario.speed, "machine": asdict(scenario.machine)}
+        known = self.world.table.body.document(1e-3 * scenario.artefact.u_length_um)
+        return {"ready": True, **urls, "speed": scenario.speed, "machine": asdict(scenario.machine), "artefact": known}
 
     async def stop(self) -> None:
         """Close all lines and ports, and remove the stable paths."""

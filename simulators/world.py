@@ -5,8 +5,9 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.simulators.arrays import F
+from abbe.simulators.artefact.table import OVERTRAVEL_S, Table
 from abbe.simulators.ballbar.device import BallbarDevice
-from abbe.simulators.cnc.device import Controller
+from abbe.simulators.cnc.device import ALARM_CRASH, NOTHING, Controller, Felt
 from abbe.simulators.hidden.live import live_of
 from abbe.simulators.laser.device import RATE_HZ, LaserDevice
 from abbe.simulators.scenario import Magnitudes, Scenario
@@ -40,6 +41,10 @@ class World:
         if self.hidden is not None:
             self.laser.too_much = self.hidden.laser_mm
             self.ballbar.too_much = self.hidden.bar_mm
+        self.table = Table(scenario, geometry.tool_mm)
+        self.controller.feel = self._felt
+        self.controller.probe_fitted = lambda: self.table.fitted
+        self.controller.deflected = lambda: self.table.fitted and self.table.deflected(self.tool_position(), self.time_s)
         self._play = Play(self.draws.backlash_mm, self.controller.position_mm)
         self._laser_tick = 0
         self.laser.record(0, 0.0, self._play.position_mm)
@@ -65,6 +70,9 @@ class World:
             self._laser_tick = tick
         self.controller.advance(to_s)
         self.time_s = to_s
+        self.table.temperature_c = self.air.at(to_s).temperature_c
+        if self.controller.alarm == ALARM_CRASH:
+            self.table.stylus.broken = True
 
     def locate(self, times_s: F, axes_mm: F) -> F:
         """Return the actual tool position in workpiece coordinates at n instants with the axes at (n, 3) mm: (n, 3) mm, drift included."""
@@ -86,6 +94,26 @@ class World:
         """Make the air warmer by ``plus_c`` K from now on; earlier samples do not change."""
         self.laser.output()
         self.air.warmer_c += plus_c
+
+    def _felt(self, start_mm: F, target_mm: F, feed_mm_min: float) -> Felt:
+        """Return what the probe meets on a straight move from now on; the lost motion is as the axes stand, and is not changed."""
+        way, length = target_mm - start_mm, float(np.linalg.norm(target_mm - start_mm))
+        if not self.table.fitted or length == 0.0:
+            return NOTHING
+        speed = feed_mm_min / 60.0
+
+        def tip(shares: F) -> F:
+            times = self.time_s + shares * length / speed
+            command = start_mm + shares[:, None] * way
+            drives: F = command + self.controller.comp.correction(command)
+            axes = self._play.ahead(drives)
+            if self.hidden is not None:
+                axes = axes + self.hidden.displacement(times, drives)
+            return self.locate(times, axes)
+
+        trip = self.table.contact(length, way / length, tip, self.time_s)
+        stop = length if trip is None else min(length, trip + OVERTRAVEL_S * speed)
+        return Felt(trip, stop, self.table.crash(length, tip, self.time_s))
 
     def _axes(self, times_s: F) -> F:
         """Return the axis positions at n ordered instants from now on, (n, 3) mm; lost motion and hidden effects remember them."""

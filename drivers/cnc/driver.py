@@ -6,7 +6,7 @@ import asyncio
 from collections.abc import AsyncIterator, Sequence
 from contextlib import asynccontextmanager
 
-from abbe.drivers.api import Condition, ControllerStatus, Point
+from abbe.drivers.api import Condition, ControllerStatus, Latch, Point, ProbeState
 from abbe.drivers.cnc import registers as reg
 from abbe.drivers.cnc.banks import Banks
 from abbe.drivers.errors import DeviceFault, DriverError, Refused, ReplyTimeout, run_to_end
@@ -47,20 +47,45 @@ class ModbusController(Banks):
         ReplyTimeout
             Not in position in time.
         """
-        target = self._counts(target_mm, "move")
+        block = await self._moved(reg.MOVE, "move", target_mm, feed_mm_min, timeout_s)
+        return self._at_target(block, "move", target_mm)
+
+    async def probe_state(self) -> ProbeState:
+        """Return whether a touch probe is fitted and deflected."""
+        return (await self.block()).probe
+
+    async def touch(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> Latch | None:
+        """Move as `move`, but the axes stop when the touch probe trips; return where it tripped, None at the target without a trip.
+
+        Raises
+        ------
+        Refused, DeviceFault, ReplyTimeout
+            As `move`; refused, too, without a probe.
+        """
+        block = await self._moved(reg.TOUCH, "touch", target_mm, feed_mm_min, timeout_s)
+        if block.latch_seq == block.motion_done_seq:
+            return block.latch
+        self._at_target(block, "touch", target_mm)
+        return None
+
+    async def _moved(self, command: int, operation: str, target_mm: Point, feed_mm_min: float, timeout_s: float) -> reg.StatusBlock:
+        """Command a straight motion and return the status in which it is done."""
+        target = self._counts(target_mm, operation)
         try:
             async with self._hold_on_trouble(), asyncio.timeout(timeout_s):
-                number = await self._command(reg.MOVE, "move", target, feed_mm_min)
-                status = await self._done(number)
+                number = await self._command(command, operation, target, feed_mm_min)
+                return await self._done(number)
         except TimeoutError as error:
             if isinstance(error, DriverError):
                 raise
-            late = ReplyTimeout(self.name, "move", f"not in position after {timeout_s:g} s, feed hold set", "override at 0?")
+            late = ReplyTimeout(self.name, operation, f"not in position after {timeout_s:g} s, feed hold set", "override at 0?")
             raise _with_notes(late, error) from None
-        if self._counts(status.position_mm, "move") != target:
-            detail = f"the move ended at {status.position_mm} instead of {tuple(target_mm)}: aborted"
-            raise DeviceFault(self.name, "move", detail, "start again when the reason is known")
-        return status
+
+    def _at_target(self, block: reg.StatusBlock, operation: str, target_mm: Point) -> ControllerStatus:
+        if self._counts(block.status.position_mm, operation) != self._counts(target_mm, operation):
+            detail = f"the {operation} ended at {block.status.position_mm} instead of {tuple(target_mm)}: aborted"
+            raise DeviceFault(self.name, operation, detail, "start again when the reason is known")
+        return block.status
 
     async def load_path(self, points_mm: Sequence[Point]) -> None:
         """Clear the controller's path and load these points (mm); nothing moves.
@@ -171,7 +196,7 @@ class ModbusController(Banks):
         async with self._commands:
             block = await self.block()
             reasons = reg.interlocks(block.status.conditions)  # an open door may also show as feed hold: report the door
-            if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.PATH_START):
+            if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.TOUCH, reg.PATH_START):
                 raise Refused(self.name, operation, "feed hold is on", "release it or abort the motion, when it is safe")
             number = next_number(block.motion_ack_seq)
             try:
@@ -194,13 +219,13 @@ class ModbusController(Banks):
             raise Refused(self.name, operation, detail, f"{unseen}look at the machine, then try again")
         return number
 
-    async def _done(self, number: int) -> ControllerStatus:
+    async def _done(self, number: int) -> reg.StatusBlock:
         while True:
             block = await self.block()
             # Faults first: after an alarm the controller may count the command as done.
             self._check(block)
             if block.motion_done_seq == number:
-                return block.status
+                return block
             if Condition.FEED_HOLD in block.status.conditions:
                 raise _MotionStopped(self.name, "move", "stopped by feed hold", "release it or abort the motion, when it is safe")
             if block.motion_ack_seq != number:

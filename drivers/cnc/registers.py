@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 
-from abbe.drivers.api import NOTHING_HOLDS, BankState, CompStatus, Condition, ControllerStatus, Point
+from abbe.drivers.api import NOTHING_HOLDS, BankState, CompStatus, Condition, ControllerStatus, Latch, Point, ProbeState
 from abbe.drivers.links.words import Register, RegisterBlock, words_of
 
 MAP_VERSION = 1
@@ -54,6 +54,12 @@ STATUS = RegisterBlock(
         Register(44, "u64", "IN_POSITION_US", 1e6, "s"),
         Register(48, "u16", "FIFO_ACK_SEQ"),
         Register(49, "u16", "FIFO_RESULT"),
+        Register(50, "u16", "PROBE_BITS"),
+        Register(51, "i32", "LATCH_X", COUNTS_PER_MM, "mm"),
+        Register(53, "i32", "LATCH_Y", COUNTS_PER_MM, "mm"),
+        Register(55, "i32", "LATCH_Z", COUNTS_PER_MM, "mm"),
+        Register(57, "u64", "LATCH_US", 1e6, "s"),
+        Register(61, "u16", "LATCH_SEQ"),
     ),
     lead=16,
 )
@@ -79,7 +85,7 @@ BANK_BASE = (1000, 6000)
 BANK_REGISTERS = 4800
 AXES = 3
 
-MOVE, PATH_CLEAR, PATH_START, RESET_ALARM = 1, 2, 3, 4
+MOVE, PATH_CLEAR, PATH_START, RESET_ALARM, TOUCH = 1, 2, 3, 4, 5
 RUN, HOLD, ABORT = 0, 1, 2
 SEAL, ACTIVATE, LEASE, RELEASE = 1, 2, 3, 4
 
@@ -89,6 +95,7 @@ MOTION_RESULT = {
     3: "target beyond the strokes",
     4: "FIFO full",
     5: "busy moving",
+    6: "no touch probe is fitted",
 }
 COMP_RESULT = {
     1: "bad argument",
@@ -101,7 +108,7 @@ COMP_RESULT = {
     8: "staged: it takes effect after the control's restart, until then the other bank acts",
 }
 BANK_STATES = {0: BankState.EMPTY, 1: BankState.WRITING, 2: BankState.SEALED, 3: BankState.LAID_ASIDE}
-ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty"}
+ALARM = {1: "e-stop", 2: "stroke limit", 3: "path ran empty", 4: "the stylus was driven into something"}
 
 
 class Bit(IntFlag):
@@ -161,7 +168,10 @@ def interlocks(conditions: Condition) -> list[str]:
 
 @dataclass(frozen=True, slots=True)
 class StatusBlock:
-    """Registers 16..63: the controller's status and the outcome of its commands. ``fifo_free``: free points of its path memory."""
+    """Registers 16..63: the controller's status and the outcome of its commands.
+
+    ``fifo_free``: free points of its path memory; ``latch``: position at which the probe tripped in motion command ``latch_seq``.
+    """
 
     status: ControllerStatus
     alarm_code: int
@@ -171,12 +181,16 @@ class StatusBlock:
     fifo_free: int
     fifo_ack_seq: int
     fifo_result: int
+    probe: ProbeState
+    latch: Latch
+    latch_seq: int
 
 
 def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
     """Decode registers 16..63, read in one request; ``host_s``: monotonic time at which the reply was complete."""
     counts = STATUS.counts(words)
     x, y, z = (STATUS.physical(name, counts[name]) for name in ("POSITION_X", "POSITION_Y", "POSITION_Z"))
+    u, v, w = (STATUS.physical(name, counts[name]) for name in ("LATCH_X", "LATCH_Y", "LATCH_Z"))
     status = ControllerStatus(
         host_s=host_s,
         ctrl_us=counts["CTRL_TIME_US"],
@@ -197,6 +211,9 @@ def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
         fifo_free=counts["FIFO_FREE"],
         fifo_ack_seq=counts["FIFO_ACK_SEQ"],
         fifo_result=counts["FIFO_RESULT"],
+        probe=ProbeState(fitted=bool(counts["PROBE_BITS"] & 1), deflected=bool(counts["PROBE_BITS"] & 2)),
+        latch=Latch((u, v, w), counts["LATCH_US"]),
+        latch_seq=counts["LATCH_SEQ"],
     )
 
 

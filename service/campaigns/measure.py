@@ -39,7 +39,7 @@ from abbe.service.sequences.paths import warnings_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import Attempt
 from abbe.service.sequences.runner import Runner, Tick
-from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
 from abbe.service.sequences.waiting import ExpectedTable
 from abbe.service.sequences.watch import IncidentNotes, incidents_noted, run_named
 from abbe.service.site import Site
@@ -156,6 +156,12 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
     return await store.write(store.campaigns.add, machine_id, name, doc), status.ctrl_us
 
 
+def artefacts_of(plan: CampaignPlan) -> dict[str, Any]:
+    """Return the artefacts that a plan probes, as a field of the campaign's document; empty without one."""
+    known = {name: doc for test in plan.tests for name, doc in test.artefact.items()}
+    return {"artefacts": known} if known else {}
+
+
 async def _table_in_force(session: Session) -> dict[str, int] | None:
     """Return the compensation table in force as in a run's document; None for a control that shows none."""
     if only_listens(session.controller):
@@ -213,7 +219,7 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     await check_devices(session, plan, air=site.watching.air_c is not None)
     if resumed is not None:
         campaign = resumed.campaign
-    campaign = campaign or await start_campaign(session, store, site, plan.name)
+    campaign = campaign or await start_campaign(session, store, site, plan.name, artefacts_of(plan))
     under_way = OpenCampaign(*campaign, dict(resumed.mounted_us) if resumed is not None else {})
     journal = StoreJournal(store, under_way.id)
     campaign_run = await _campaign_run(session, store, site, plan, journal, options, control)
@@ -422,5 +428,6 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
     """Return the number of readings at standstill in a whole run: those of its steps and those kept, of which the last is read again."""
-    count = sum(isinstance(step, ReadLaser | ReadBar) for step in test.steps)
-    return {"standstills": count + max(0, len(attempt.resume_trail.carried) - 1)} if count else {}
+    count = sum(isinstance(step, ReadLaser | ReadBar | TouchFeature) for step in test.steps)
+    kept = len(attempt.resume_trail.carried)
+    return {"standstills": count + (kept if attempt.resume_trail.again else max(0, kept - 1))} if count else {}

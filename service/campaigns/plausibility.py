@@ -25,9 +25,20 @@ from abbe.service.devices.session import Session, raise_all
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.check import dry_run_campaign, paced
+from abbe.service.sequences.probing import need_probe
 from abbe.service.sequences.recipes.campaigns import campaign_source, recipe_plan
 from abbe.service.sequences.resume_plan import BY_HAND
-from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, ReadBar, ReadLaser, RecordPath, ZeroLaser
+from abbe.service.sequences.steps import (
+    CampaignPlan,
+    ChangeBar,
+    MountBar,
+    MountLaser,
+    ReadBar,
+    ReadLaser,
+    RecordPath,
+    TouchFeature,
+    ZeroLaser,
+)
 from abbe.service.site import Site, site_of
 
 CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
@@ -93,6 +104,8 @@ async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = Fal
     troubles: list[AbbeError | DriverError] = []
     try:
         check_configured(needed, [CNC, *there])
+        if any(isinstance(s, TouchFeature) for t in plan.tests for s in t.steps):
+            need_probe(session.controller)
     except ConfigError as error:
         troubles.append(error)
     ask: dict[str, Callable[[Session, Needed], Awaitable[None]]] = {BALLBAR: _ballbar, LASER: _laser, FIXTURE: _fixture}

@@ -23,6 +23,7 @@ from abbe.service.campaigns.campaign_run import (
     resumed_item,
 )
 from abbe.service.devices.session import Session
+from abbe.service.domain.artefact import ARTEFACT_TEST
 from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointRecord
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.columns import LASER_CHANNEL, decode_json
@@ -36,7 +37,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 COMPLETE = "complete"
-MOUNTS = ("MountBar", "MountLaser")
+MOUNTS = ("MountBar", "MountLaser", "MountArtefact")
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,6 +175,8 @@ class _Finder:
             return mounted_anew(item, number + 1)
         kept = len(item.resume_trail.carried)
         how = f"resumes after point {kept}, which is read again" if kept else "begins again"
+        if item.resume_trail.again is not None:
+            how = f"resumes after {kept} features; the first one is touched again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
             how = f"resumes at {at} of its path, a stretch of which is read again"
@@ -192,11 +195,12 @@ class _Finder:
                 in_mounting(item, number) if number > 1 else Item(item.test, item.first, anew(item.test, 1), item.test, before=item.before)
             )
         hand = last.step if last.test == label else None
-        records = self._records(label, number) if await counting(session) else ()
+        kept = item.test.test == ARTEFACT_TEST or await counting(session)
+        records = self._records(label, number) if kept else ()
         return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
     def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
-        """Return the laser records of the last run of a test in this mounting."""
+        """Return the records of the last run of a test in this mounting."""
         runs = [n for n, one in self._lines.runs.items() if (one.test, one.mounting) == (label, number)]
         if not runs:
             return ()

@@ -34,12 +34,13 @@ class PoseObject(FileObject):
 
 
 class Feature(FileObject):
-    """One hole, ball or wall: nominal place, sensed axes of the artefact, and for a wall its outward normal."""
+    """One hole, ball or wall: nominal place, sensed axes of the artefact, for a wall its outward normal, and for probing its radius."""
 
     id: Name
     nominal_mm: Point
     sensed: Literal["x", "y", "z", "xy", "xz", "yz", "xyz"] = "xyz"
     normal: Point | None = None
+    radius_mm: float | None = Field(None, gt=0.0)
 
 
 class CalibratedLength(FileObject):

@@ -9,7 +9,7 @@ import asyncio
 from dataclasses import replace
 
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.measure import MeasureOptions, measure, start_campaign
+from abbe.service.campaigns.measure import MeasureOptions, artefacts_of, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates, check_devices, needed_by
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
@@ -82,7 +82,7 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
             await check_devices(session, plan, air=site.watching.air_c is not None)
             await context.control.gate()
             await _check_table_acts(session)
-            begun = await start_campaign(session, store, site, name)
+            begun = await start_campaign(session, store, site, name, artefacts_of(plan))
             try:
                 await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options)
             except BaseException as error:

@@ -5,17 +5,19 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.domain.artefact import ARTEFACT_TEST
 from abbe.service.rendering.document import Document, PictureBlock, Section, TextTable
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.rendering.plots.views import DrawnTest, three_views
 from abbe.service.sequences.check import DryRun
-from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan
+from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
 
 NAMES = {
     "ballbar_helix": "ball-bar helix",
     "ballbar_circle": "ball-bar circle",
     "laser_diagonal": "laser diagonal",
     "laser_linear": "laser line",
+    ARTEFACT_TEST: "points of an artefact",
 }
 
 
@@ -54,7 +56,8 @@ def _row(k: int, test: TestPlan, run: DryRun) -> tuple[str, ...]:
 def _drawn(order: int, test: TestPlan) -> DrawnTest:
     bar = test.test.startswith("ballbar")
     path = np.array(_read_places(test))
-    mount = np.array(test.setup["centre_mm"] if bar else test.setup["start_mm"], dtype=np.float64)
+    place = test.setup["pose"]["origin_mm"] if test.test == ARTEFACT_TEST else test.setup["centre_mm" if bar else "start_mm"]
+    mount = np.array(place, dtype=np.float64)
     radius = float(test.setup["radius_mm"]) if bar else 0.0
     mounted = ", bar mounted here" if any(isinstance(s, MountBar) for s in test.steps) else ""
     text = f"{test.label}: {NAMES.get(test.test, test.test)}{mounted}"
@@ -72,4 +75,6 @@ def _read_places(test: TestPlan) -> list[Point]:
             out += step.points_mm
         elif isinstance(step, ReadLaser | ReadBar) and here is not None:
             out.append(here)
+        elif isinstance(step, TouchFeature):
+            out.append(step.centre_mm)
     return out

@@ -16,6 +16,7 @@ from dataclasses import replace
 from typing import Any
 
 from abbe.drivers.api import BarSample
+from abbe.service.domain.artefact import ARTEFACT_TEST
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import ChunkRecord, RunEnd, RunRecord, RunStart
 from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
@@ -31,6 +32,7 @@ from abbe.service.runs.sample_columns import (
     starts_in_stream,
     sync_edges,
 )
+from abbe.service.runs.touches import touch_columns
 from abbe.service.storage.store import Store
 
 BAR_CODEC = "bar/1"
@@ -244,7 +246,7 @@ def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord])
         clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end, edges)
         return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate), clock.doc
     records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
-    make = bar_point_columns if record.test.startswith("ballbar") else laser_columns
+    make = touch_columns if record.test == ARTEFACT_TEST else bar_point_columns if record.test.startswith("ballbar") else laser_columns
     return make(records, start), {}
 
 

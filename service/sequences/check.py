@@ -17,6 +17,7 @@ from abbe.service.sequences.steps import (
     CampaignPlan,
     ChangeBar,
     FollowPath,
+    MountArtefact,
     MountBar,
     MountLaser,
     MoveTo,
@@ -27,6 +28,7 @@ from abbe.service.sequences.steps import (
     Step,
     TakeBarOut,
     TestPlan,
+    TouchFeature,
     Unmount,
     ZeroLaser,
 )
@@ -56,6 +58,8 @@ def positions(steps: tuple[Step, ...]) -> Iterator[Point]:
             yield step.target_mm
         elif isinstance(step, RecordPath | FollowPath):
             yield from step.points_mm
+        elif isinstance(step, TouchFeature):
+            yield from step.places_mm()
 
 
 def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
@@ -70,8 +74,17 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
             return settle + samples / rate_hz, here
         case ReadLaser(_, settle):
             return settle + 0.1, here
-        case MountBar() | TakeBarOut() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
+        case TouchFeature():
+            return _touch_seconds(step, here), step.above_mm
+        case MountArtefact() | MountBar() | TakeBarOut() | ChangeBar() | MountLaser() | Unmount() | ZeroLaser():
             return MOUNT_S, here
+
+
+def _touch_seconds(step: TouchFeature, here: Point | None) -> float:
+    """Time of all touches of a feature: way there and between the sides, then for every repeat to and fro."""
+    way = sum(math.dist(a, b) for a, b in pairwise(step.places_mm())) + (0.0 if here is None else math.dist(here, step.above_mm))
+    touches = len(step.sides) * step.repeats
+    return 60.0 * (way / step.feed_mm_min + touches * step.search_mm * (1.0 / step.touch_feed_mm_min + 1.0 / step.feed_mm_min))
 
 
 def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
@@ -96,7 +109,7 @@ def check_positions(machine: Machine, plan: TestPlan) -> tuple[Point, Point]:
         over = low[a] - at[n, a] if at[n, a] < low[a] else at[n, a] - high[a]
         raise StrokeError(
             f"test {plan.label}: {AXES[a]} would go to {at[n, a]:.3f} mm, {over:.3f} mm beyond its stroke {low[a]:g}..{high[a]:g}",
-            "move the centre, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
+            "move the centre or the artefact, shorten the radius or correct stroke_mm in the machine file; nothing has moved",
         )
     lo, hi = at.min(axis=0, initial=math.inf).tolist(), at.max(axis=0, initial=-math.inf).tolist()
     return (lo[0], lo[1], lo[2]), (hi[0], hi[1], hi[2])
@@ -109,7 +122,7 @@ def paced(plan: CampaignPlan, max_feed_mm_min: float) -> CampaignPlan:
     """
 
     def slowed(step: Step) -> Step:
-        if not isinstance(step, MoveTo | FollowPath):
+        if not isinstance(step, MoveTo | FollowPath | TouchFeature):
             return step
         return replace(step, feed_mm_min=min(step.feed_mm_min, max_feed_mm_min))
 
@@ -134,7 +147,7 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
             readings += int(dt * step.rate_hz) if isinstance(step, RecordPath) else 0
         elif isinstance(step, MoveTo) and here is not None:
             length += math.dist(here, step.target_mm)
-        readings += isinstance(step, ReadLaser | ReadBar)
+        readings += isinstance(step, ReadLaser | ReadBar | TouchFeature)
         seconds, here = seconds + dt, after
     return DryRun(plan.label, plan.test, seconds, length, lowest, highest, readings, fastest(plan))
 
@@ -156,7 +169,8 @@ def _check_cup(plan: TestPlan) -> None:
 
 def fastest(plan: TestPlan) -> float:
     """Return the largest feed of a test, mm/min."""
-    return max((s.feed_mm_min for s in plan.steps if isinstance(s, MoveTo | RecordPath | FollowPath)), default=0.0)
+    moving = MoveTo | RecordPath | FollowPath | TouchFeature
+    return max((s.feed_mm_min for s in plan.steps if isinstance(s, moving)), default=0.0)
 
 
 def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: float = math.inf) -> tuple[DryRun, ...]:

@@ -2,7 +2,7 @@
 
 A bar must not move through its sphere, nor a mirror out of its beam: the machine returns the way the test came, to the last checkpoint. A
 ball-bar path resumes where it was interrupted, or begins again. A laser run resumes after its last complete point, once that point has
-been read again with the same result.
+been read again with the same result. An artefact resumes at the next feature, once its first feature has been touched again.
 
 While the ball-bar records, the controller's statuses show how far the axes came at constant feed (`PathProgress`). If the path is
 interrupted and bar and cup stay in place, the machine need not begin again: it drives back along the path beyond the last valid point, by a
@@ -27,6 +27,7 @@ from abbe.service.sequences.recipes.approach import cup_of, over_pole
 from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
+    MountArtefact,
     MountBar,
     MountLaser,
     MoveTo,
@@ -37,6 +38,7 @@ from abbe.service.sequences.steps import (
     Step,
     TakeBarOut,
     TestPlan,
+    TouchFeature,
     Unmount,
 )
 
@@ -213,7 +215,7 @@ class StretchComparison:
             )
 
 
-BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount
+BY_HAND = MountBar | TakeBarOut | ChangeBar | MountLaser | MountArtefact | Unmount
 STANDS = MountBar | TakeBarOut | ChangeBar | MountLaser
 """Steps after which the machine holds a bar, a cup or a mirror."""
 OFF_PATH_MM = 0.05
@@ -232,7 +234,8 @@ class ResumeTrail:
 
     With ``carried`` records the last one is read again at ``upto``. On the way forward every axis moves as before, so that its lost motion
     is the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.
-    Trail of one point: the machine must stand there, and nothing moves.
+    Trail of one point: the machine must stand there, and nothing moves. ``again``: reference feature of an artefact, which is touched again
+    and must lie where the first of the ``carried`` records found it.
     """
 
     trail: tuple[Point, ...] = ()
@@ -241,6 +244,7 @@ class ResumeTrail:
     feed_mm_min: float = 1000.0
     latest: bool = False
     carried: tuple[dict[str, Any], ...] = ()
+    again: TouchFeature | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,6 +288,8 @@ def rest_of(
     if hand is not None and isinstance(test.steps[hand], TakeBarOut) and start is None:
         start = before
     steps = test.steps[first:]
+    if records and any(isinstance(s, TouchFeature) for s in steps):
+        return _after_feature(test, records)
     if len(records) >= KEEP_FROM and not any(isinstance(s, RecordPath | ReadBar) for s in steps):
         return _after_point(test, first, records)
     stands = start is not None and (hand is None or isinstance(test.steps[hand], STANDS))
@@ -328,6 +334,14 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
     feed = min(s.feed_mm_min for s in test.steps if isinstance(s, MoveTo))
     resume_trail = ResumeTrail(come + ahead, _all_axes_from(come), upto, feed, True, records[: len(reads)])
     return replace(test, steps=test.steps[last + 1 :]), last + 1, resume_trail, None
+
+
+def _after_feature(test: TestPlan, records: tuple[dict[str, Any], ...]) -> Rest:
+    """Resume an artefact at the next feature, after its reference was touched again. The stylus leaves a feature by itself."""
+    touches = [(k, s) for k, s in enumerate(test.steps) if isinstance(s, TouchFeature)]
+    done = min(len(records), len(touches) - 1)  # the last one is the reference
+    first = touches[done][0]
+    return replace(test, steps=test.steps[first:]), first, ResumeTrail(carried=records[:done], again=touches[0][1]), None
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:

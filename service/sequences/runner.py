@@ -16,10 +16,12 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import AT_WORK, PAUSED, Control, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
+from abbe.service.sequences.probing import FeatureTouch, check_unmoved, need_probe
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
     FollowPath,
+    MountArtefact,
     MountBar,
     MountLaser,
     MoveTo,
@@ -29,6 +31,7 @@ from abbe.service.sequences.steps import (
     Step,
     TakeBarOut,
     TestPlan,
+    TouchFeature,
     Unmount,
     ZeroLaser,
 )
@@ -115,7 +118,7 @@ class Runner:
         """Progress of the recorded path."""
         self._remainder: PathRemainder | None = None
         self.records: list[dict[str, Any]] = []
-        """Laser records since the zero: a resumed run can begin with them."""
+        """Laser records since the zero, or touched features since the mounting: a resumed run can begin with them."""
 
     async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick, attempt: Attempt | None = None) -> dict[str, int]:
         """Execute a test, or the rest of it; return the controller times (us) for the end document.
@@ -196,7 +199,7 @@ class Runner:
             watch.beam = False
         if isinstance(step, ReadLaser):
             watch.beam = True
-        if isinstance(step, ReadLaser | ReadBar):
+        if isinstance(step, ReadLaser | ReadBar | TouchFeature):
             self._points, self.gained = self._points + 1, True
             if attempt.run_id:
                 await self.journal.add(POINT, test=attempt.test, run=attempt.run_id, step=attempt.offset + k, points=self._points)
@@ -215,7 +218,7 @@ class Runner:
         status = await self._s.controller.status()  # mounting takes minutes: read the clock afterwards
         await self.journal.add(HAND, phase="done", ctrl_us=status.ctrl_us, **line)
         self.hand, self.asked = attempt.offset + k, None
-        if not isinstance(step, MountBar | MountLaser):
+        if not isinstance(step, MountBar | MountLaser | MountArtefact):
             return {}
         self.mounted_us = status.ctrl_us
         return {"mounted_us": status.ctrl_us}
@@ -225,6 +228,8 @@ class Runner:
     async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
         """Return to the last checkpoint along the way that the test came; return the new position, or None if nothing is mounted."""
         resume_trail = attempt.resume_trail
+        if resume_trail.again is not None:
+            return await self._same_artefact(resume_trail.again, resume_trail.carried, recorder, watch)
         if not resume_trail.trail:
             return None
         status = await self._s.controller.status()
@@ -257,6 +262,15 @@ class Runner:
             await self._kept(one, recorder)
         self._points = len(carried)
 
+    async def _same_artefact(self, reference: TouchFeature, carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch) -> Point:
+        """Touch the first feature again: only an equal place proves an undisturbed artefact. Then keep the earlier features."""
+        await self._safe_place(reference, watch)
+        check_unmoved(await self._touched(reference), list(carried))
+        for one in carried:
+            await self._kept(one, recorder)
+        self._points = len(carried)
+        return reference.above_mm
+
     # ---- single steps -----------------------------------------------------------------------------------------------
 
     def _done_by_hand(self, step: Step) -> Awaitable[None]:
@@ -270,6 +284,8 @@ class Runner:
                 return fixture.change_ballbar(radius)
             case MountLaser(beam):
                 return fixture.mount_laser(beam)
+            case MountArtefact(origin, matrix):
+                return fixture.mount_artefact(origin, matrix)
         return fixture.unmount()
 
     async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
@@ -285,12 +301,25 @@ class Runner:
             case ReadBar():
                 settled = await self._settled(step.settle_s)
                 await recorder.add_record(await read_bar(self._s.need_ballbar(), step, settled, here))
+            case TouchFeature():
+                record = await self._touched(step)
+                check_unmoved(record, self.records)
+                await self._kept(record, recorder)
             case FollowPath():
                 await self._stands_at(step.points_mm[0])
                 await follow_path(self._s.controller, step, self._control)
             case RecordPath():
                 return await self._recorded(step, recorder)
         return {}
+
+    async def _touched(self, step: TouchFeature) -> dict[str, Any]:
+        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by."""
+        record = await FeatureTouch(need_probe(self._s.controller), step).run()
+        status = await self._s.controller.status()
+        check_interlocks(status)
+        air_c = None if self._s.laser is None else (await self._s.laser.peek()).air_temp_c
+        known = {} if air_c is None or math.isnan(air_c) else {"temperature_C": air_c}
+        return {"host_s": status.host_s, "ctrl_us": status.ctrl_us, **record, **known}
 
     async def _stands_at(self, start_mm: Point) -> None:
         """Refuse a path unless the machine stands at its start: from elsewhere the first move may lead through the sphere."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -46,7 +47,7 @@ class MountLaser:
 
 @dataclass(frozen=True, slots=True)
 class Unmount:
-    """A person takes bar and mirror away before anything moves fast again. Skipped when the test fails: a person is there anyway."""
+    """A person clears the table before anything moves fast again. Skipped when the test fails: a person is there anyway."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,7 +95,73 @@ class ReadBar:
     rate_hz: int = 1000
 
 
-Step = MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath | FollowPath | ReadBar
+@dataclass(frozen=True, slots=True)
+class MountArtefact:
+    """A person clamps an artefact in this pose (axis position of its zero; columns of ``matrix``: its axes) and fits the touch probe."""
+
+    origin_mm: Point
+    matrix: tuple[Point, Point, Point]
+
+
+@dataclass(frozen=True, slots=True)
+class TouchFeature:
+    """Touch a hole or ball from all sides; begins and ends above it, where the stylus is clear of everything.
+
+    ``centre_mm``: expected axis position with the tip in its centre (hole: at the depth of the touches); ``radius_mm``: expected distance
+    of the tip's centre from it when it touches; ``sides``: unit vectors from the centre to the touches; ``inside``: a hole; ``up``: unit
+    vector away from the artefact; ``clear_mm``: height above the centre that is clear. A touch runs from ``search_mm`` before the expected
+    contact to as far beyond it. ``nominal_mm``: in the artefact's axes; ``start_deg``: direction of the first touch.
+    """
+
+    feature: str
+    nominal_mm: Point
+    centre_mm: Point
+    radius_mm: float
+    sides: tuple[Point, ...]
+    inside: bool
+    up: Point
+    clear_mm: float
+    search_mm: float
+    repeats: int
+    feed_mm_min: float
+    touch_feed_mm_min: float
+    start_deg: float
+
+    @property
+    def above_mm(self) -> Point:
+        """Place above the feature."""
+        return self.at(self.up, self.clear_mm)
+
+    def at(self, side: Point, distance_mm: float) -> Point:
+        """Place at a distance from the centre, rounded to the controller's 10 nm."""
+        x, y, z = (round(c + distance_mm * u, 5) for c, u in zip(self.centre_mm, side, strict=True))
+        return x, y, z
+
+    def before_mm(self, side: Point) -> Point:
+        """Where a touch of this side begins."""
+        return self.at(side, self.radius_mm + (-self.search_mm if self.inside else self.search_mm))
+
+    def beyond_mm(self, side: Point) -> Point:
+        """Where a touch of this side ends if nothing is there."""
+        return self.at(side, self.radius_mm + (self.search_mm if self.inside else -self.search_mm))
+
+    def over_mm(self, side: Point) -> Point:
+        """Place above the beginning of a touch, at the height of `above_mm`."""
+        before = self.before_mm(side)
+        rise = self.clear_mm - sum((b - c) * u for b, c, u in zip(before, self.centre_mm, self.up, strict=True))
+        x, y, z = (round(b + rise * u, 5) for b, u in zip(before, self.up, strict=True))
+        return x, y, z
+
+    def places_mm(self) -> tuple[Point, ...]:
+        """All places that the tip can come to, in order."""
+        ways = [(*(() if self.inside else (self.over_mm(s),)), self.before_mm(s), self.beyond_mm(s)) for s in self.sides]
+        return (self.above_mm, self.centre_mm if self.inside else self.above_mm, *(p for way in ways for p in way), self.above_mm)
+
+
+Step = (
+    MoveTo | MountBar | TakeBarOut | ChangeBar | MountLaser | Unmount | ZeroLaser | ReadLaser | RecordPath | FollowPath | ReadBar
+    | MountArtefact | TouchFeature
+)  # fmt: skip
 
 
 @dataclass(frozen=True, slots=True)
@@ -108,11 +175,13 @@ class TestPlan:
     role: str
     setup: dict[str, Any] = field(hash=False)
     steps: tuple[Step, ...]
+    artefact: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
+    """What is known of the artefact that is probed (`abbe.service.domain.artefact.ArtefactObject`), as in the campaign's document."""
 
     @property
     def mounts(self) -> bool:
         """Whether the test begins a set-up; else it uses that of an earlier test."""
-        return any(isinstance(step, MountBar | MountLaser) for step in self.steps)
+        return any(isinstance(step, MountBar | MountLaser | MountArtefact) for step in self.steps)
 
 
 @dataclass(frozen=True, slots=True)

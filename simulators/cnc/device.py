@@ -1,5 +1,6 @@
 """The CNC controller as a state machine: interlocks, moves, paths, holds. No bytes; positions in mm, times in controller seconds."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import IntEnum
 
@@ -172,6 +173,21 @@ class Result(IntEnum):
     STROKE_LIMIT = 3
     FIFO_FULL = 4
     BUSY = 5
+    NO_PROBE = 6
+
+
+@dataclass(frozen=True, slots=True)
+class Felt:
+    """What a straight move meets: lengths after which the probe trips, the axes then stop, and the stylus breaks; None: it does not."""
+
+    trip_mm: float | None = None
+    stop_mm: float = 0.0
+    crash_mm: float | None = None
+
+
+NOTHING = Felt()
+Feel = Callable[[F, F, float], Felt]
+"""Start and target (3,) mm and feed (mm/min) of a straight move to what it meets."""
 
 
 class Hold(IntEnum):
@@ -182,7 +198,7 @@ class Hold(IntEnum):
     ABORT = 2
 
 
-ALARM_NONE, ALARM_ESTOP, ALARM_STROKE = 0, 1, 2
+ALARM_NONE, ALARM_ESTOP, ALARM_STROKE, ALARM_CRASH = 0, 1, 2, 4
 
 
 @dataclass(slots=True)
@@ -220,6 +236,15 @@ class Controller:
         self._path_points = 0
         self._fifo: list[tuple[float, float, float]] = []
         self._motion: Motion | Timetable | None = None
+        self.feel: Feel = lambda _start, _target, _feed: NOTHING
+        """What a move meets on its way; the world sets it."""
+        self.probe_fitted: Callable[[], bool] = lambda: False
+        self.deflected: Callable[[], bool] = lambda: False
+        self.latch_mm: F | None = None
+        """Position at which the probe tripped in the last touch, None if it did not; ``latch_s``: when."""
+        self.latch_s = 0.0
+        self._trip_mm: F | None = None
+        self._crash = False
 
     # ---- reading -------------------------------------------------------------------------------------------------
 
@@ -281,7 +306,11 @@ class Controller:
             if end_s <= to_s:
                 self.now_s = max(end_s, self.now_s)
                 self.position_mm = motion.target_mm.copy()
-                self._finish(motion.vertex_count)
+                self.latch_mm, self.latch_s = self._trip_mm, self.now_s
+                if self._crash:
+                    self.raise_alarm(ALARM_CRASH)
+                else:
+                    self._finish(motion.vertex_count)
             else:
                 self.position_mm = motion.position(np.array([to_s]))[0]
         self.now_s = to_s
@@ -293,7 +322,22 @@ class Controller:
         refusal = self._refuse(feed_mm_min, target_mm[None, :])
         if refusal:
             return refusal
-        self._start(np.stack([self.position_mm, target_mm]), feed_mm_min)
+        self._go(target_mm, feed_mm_min, self.feel(self.position_mm, target_mm, feed_mm_min).crash_mm)
+        return Result.OK
+
+    def touch(self, target_mm: F, feed_mm_min: float) -> Result:
+        """Go straight to a target until the probe trips; the axes then stop."""
+        refusal = self._refuse(feed_mm_min, target_mm[None, :])
+        if refusal or not self.probe_fitted():
+            return refusal or Result.NO_PROBE
+        start, felt = self.position_mm, self.feel(self.position_mm, target_mm, feed_mm_min)
+        if felt.trip_mm is None:
+            self._go(target_mm, feed_mm_min, felt.crash_mm)
+            return Result.OK
+        way = (target_mm - start) / np.linalg.norm(target_mm - start)
+        crash = felt.crash_mm if felt.crash_mm is not None and felt.crash_mm < felt.stop_mm else None
+        self._go(start + felt.stop_mm * way, feed_mm_min, crash)
+        self._trip_mm = start + felt.trip_mm * way
         return Result.OK
 
     def path_clear(self) -> Result:
@@ -312,6 +356,7 @@ class Controller:
             return Result.BAD_ARGUMENT
         vertices = np.vstack([self.position_mm[None, :], np.array(self._fifo)])
         self._fifo.clear()
+        self._trip_mm, self._crash = None, False
         self.path_running, self.path_start_s, self.path_end_s = True, self.now_s, 0.0
         self._start(vertices, feed_mm_min)
         return Result.OK
@@ -325,6 +370,7 @@ class Controller:
         if not self._inside(np.array([place for place, _ in blocks])):
             return Result.STROKE_LIMIT
         self.switches.program_running = True
+        self._trip_mm, self._crash = None, False
         self._motion, self.in_position = Timetable(self.position_mm, blocks, self.now_s), False
         self._apply_speed()
         return Result.OK
@@ -386,6 +432,16 @@ class Controller:
         self._end_here()
 
     # ---- inner ---------------------------------------------------------------------------------------------------
+
+    def _go(self, target_mm: F, feed_mm_min: float, crash_mm: float | None) -> None:
+        """Start a straight motion that may end in a crash after some way."""
+        self.latch_mm, self._trip_mm, self._crash = None, None, crash_mm is not None
+        end = target_mm
+        if crash_mm is not None:
+            end = self.position_mm + (target_mm - self.position_mm) * min(
+                1.0, crash_mm / float(np.linalg.norm(target_mm - self.position_mm))
+            )
+        self._start(np.stack([self.position_mm, end]), feed_mm_min)
 
     def _end_here(self) -> None:
         self.in_position = False

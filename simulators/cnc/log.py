@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-MOTION = ("move", "path_clear", "path_start", "reset_alarm", "fifo")
+MOTION = ("move", "touch", "path_clear", "path_start", "reset_alarm", "fifo")
 HOLDS = ("run", "hold", "abort")
 
 

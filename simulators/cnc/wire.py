@@ -15,7 +15,7 @@ UNIT_MM = 1e-5  # positions count 10 nm
 FEED_UNIT = 0.01  # mm/min
 
 _IDENTITY = struct.Struct(">ifHIIHHHH3H")  # 0..15
-_STATUS = struct.Struct(">QIHHHHiiiHIQQHQHH28x")  # 16..63
+_STATUS = struct.Struct(">QIHHHHiiiHIQQHQHHHiiiQH4x")  # 16..63
 _COMP = struct.Struct(">H2I2HHHII3H")  # 208..223, with 3 words of padding
 _MOTION_AT, _MOTION_WORDS = 64, 10
 _HOLD_AT = 80
@@ -44,6 +44,8 @@ class CncRegisters:
         self._comp = [0] * _COMP_WORDS
         self._motion_ack, self._motion_result, self._motion_done = 0, Result.OK, 0
         self._waiting: tuple[int, int] | None = None  # (command number, value of motions_done that means finished)
+        self._touch: int | None = None
+        self._latch: tuple[int, ...] = (0, 0, 0, 0, 0)
         self._fifo_ack, self._fifo_result = 0, Result.OK
         self._comp_ack, self._comp_result = 0, CompResult.OK
         self.log: list[Command] = []
@@ -91,6 +93,7 @@ class CncRegisters:
             _us(cnc.in_position_s),
             self._fifo_ack,
             self._fifo_result,
+            *self._probe(),
         )
         return words(identity + status)
 
@@ -112,6 +115,15 @@ class CncRegisters:
             switches.spindle_turning,
         )
         return sum(1 << i for i, bit in enumerate(bits) if bit)
+
+    def _probe(self) -> tuple[int, ...]:
+        """Return PROBE_BITS, the latched position, its time, and the number of the touch that latched it."""
+        cnc = self._cnc
+        bits = int(cnc.probe_fitted()) | int(cnc.deflected()) << 1
+        if self._touch is not None and self._done_number() == self._touch and cnc.latch_mm is not None:
+            self._latch = (*(round(float(p) / UNIT_MM) for p in cnc.latch_mm), _us(cnc.latch_s), self._touch)
+            self._touch = None
+        return (bits, *self._latch)
 
     def _done_number(self) -> int:
         """Return the number of the last motion command that has finished."""
@@ -186,8 +198,8 @@ class CncRegisters:
         number, command, x, y, z, feed = struct.unpack(">HHiiiI", struct.pack(f">{_MOTION_WORDS}H", *self._motion))
         if number != (self._motion_ack + 1) & 0xFFFF:
             return
-        self._note({1: "move", 2: "path_clear", 3: "path_start", 4: "reset_alarm"}.get(command, "?"), x, y, z, feed)
-        self._done_number()  # the number of an earlier motion must not be lost under this one
+        self._note({1: "move", 2: "path_clear", 3: "path_start", 4: "reset_alarm", 5: "touch"}.get(command, "?"), x, y, z, feed)
+        self._probe()  # the number and the latch of an earlier motion must not be lost under this one
         done_before = self._cnc.motions_done
         speed = feed * FEED_UNIT
         result = Result.BAD_ARGUMENT
@@ -199,8 +211,11 @@ class CncRegisters:
             result = self._cnc.path_start(speed)
         elif command == 4:
             result = self._cnc.reset_alarm()
+        elif command == 5:
+            result = self._cnc.touch(np.array([x, y, z]) * UNIT_MM, speed)
+        self._touch = number if command == 5 and result == Result.OK else None
         self._motion_ack, self._motion_result = number, result
-        if result == Result.OK and command in (1, 3):
+        if result == Result.OK and command in (1, 3, 5):
             self._waiting = (number, done_before + 1)
         elif result == Result.OK and not self._cnc.moving:
             self._motion_done, self._waiting = number, None  # finished as soon as it was executed

@@ -116,6 +116,13 @@ class Play:
         self.position_mm = out[-1].copy()
         return out
 
+    def ahead(self, drive_mm: F) -> F:
+        """Return what `run` would return, and remember nothing."""
+        kept = self.position_mm
+        out = self.run(drive_mm)
+        self.position_mm = kept
+        return out
+
     @staticmethod
     def _run_axis(drive_mm: F, half_mm: float, start_mm: float) -> F | float:
         """Follow the drive of one axis; while the drive stays within the play, the axis rests."""

@@ -20,6 +20,7 @@ import numpy as np
 from abbe.drivers.api import BarBatch
 from abbe.models.machine import Machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control, Watching
 from abbe.service.sequences.recipes import recipe as recipes
@@ -33,6 +34,17 @@ from abbe.simulators.site import Site as Simulated
 from tests.faults.on_sphere import OnSphere
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]), np.zeros((3, 3)), np.array([0.0, 0.0, -120.0]))
+PLATE = ArtefactObject.read(
+    {
+        "kind": "hole_plate",
+        "features": [
+            {"id": f"{'ABC'[i]}{j + 1}", "nominal_mm": [45.0 * i, 45.0 * j, 0.0], "sensed": "xy", "radius_mm": 10.0}
+            for j in range(2)
+            for i in range(3)
+        ],
+    }
+)
+"""The first two rows of the simulated plate, three holes each."""
 SMALL: dict[str, Any] = {
     "label": "test",
     "setup_id": "S",
@@ -58,6 +70,13 @@ OWN: dict[str, dict[str, Any]] = {
     "Diagonal": {"diagonal": "ppp"},
     "FaceDiagonal": {"diagonal": "pp", "at_share": 0.5},
     "Linear": {"at_share": (0.5, 0.5)},
+    "ArtefactTest": {
+        "artefact": "A",
+        "origin_mm": (250.0, 200.0, 200.0),
+        "plate": PLATE.model_copy(update={"features": PLATE.features[:2]}),
+        "feed_mm_min": 6000.0,
+        "touch_feed_mm_min": 300.0,
+    },
 }
 
 
@@ -127,6 +146,7 @@ class Paced(Simulated):
         self.world.laser.block(blocked=False)
         self.world.ballbar.push(out=False)
         self.world.laser.unmount()
+        self.world.table.unmount()
         self.world.ballbar.unmount()
 
 

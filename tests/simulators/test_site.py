@@ -90,7 +90,7 @@ def test_canaries_byte_for_byte(start) -> None:
 def test_ready_line_and_machine(start) -> None:
     with start("--seed", "5", "--speed", "7", "--ballbar", "tcp") as sim:
         ready = sim.ready
-        assert set(ready) == {"ready", "ballbar", "laser", "cnc", "fixture", "speed", "machine"}
+        assert set(ready) == {"ready", "ballbar", "laser", "cnc", "fixture", "speed", "machine", "artefact"}
         assert (ready["ready"], ready["speed"]) == (True, 7.0)
         assert ready["machine"] == {
             "chain": "w-X-Y-b-Z-t",

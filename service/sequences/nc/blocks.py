@@ -11,6 +11,7 @@ import numpy as np
 
 from abbe.models.machine import AXES
 from abbe.models.paths import PLANES
+from abbe.service.errors import ConfigError
 from abbe.service.sequences.steps import (
     CampaignPlan,
     ChangeBar,
@@ -25,6 +26,7 @@ from abbe.service.sequences.steps import (
     Step,
     TakeBarOut,
     TestPlan,
+    TouchFeature,
     Unmount,
     ZeroLaser,
 )
@@ -119,6 +121,8 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
     )
     count = 0
     blocks: list[Block] = []
+    if any(isinstance(s, TouchFeature) for t in plan.tests for s in t.steps):
+        raise ConfigError("an NC program of Abbe does not touch", "use the control's own measuring cycles, and import their points")
     for test in plan.tests:
         blocks.append(Comment(f"test {test.label}: {test.test} in set-up {test.setup['setup_id']}"))
         for block in _test(test, arcs):

@@ -50,6 +50,7 @@ from abbe.service.sequences.recipes.approach import (
     pole_of,
     to_path,
 )
+from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.steps import (
     MAX_PATH_POINTS,
     FollowPath,
@@ -430,4 +431,4 @@ def _laser_plan(recipe: LaserRecipe, test: str, setup: dict[str, Any], out: Arra
     return TestPlan(recipe.label, test, recipe.role, setup, tuple(steps))
 
 
-Recipe = BarRecipe | LaserRecipe
+Recipe = BarRecipe | LaserRecipe | ArtefactTest

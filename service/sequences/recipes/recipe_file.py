@@ -17,8 +17,10 @@ import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 from pydantic_core import ErrorDetails
 
+from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.errors import ConfigError, expected, location_text, nearest
 from abbe.service.sequences.recipes.approach import LOW_SHARE, Cup, TestRecipe, file_fields, file_table, pole_of
+from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.recipes.recipe import BarRecipe, Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear, Recipe
 
 
@@ -94,6 +96,7 @@ def _mounting(group: list[Recipe], k: int) -> Recipe:
 FORMAT = "abbe-recipe/1"
 KINDS: dict[str, type[TestRecipe]] = {
     "helix": Helix, "helix_points": HelixPoints, "circle": Circle, "diagonal": Diagonal, "face": FaceDiagonal, "line": Linear,
+    "artefact": ArtefactTest,
 }  # fmt: skip
 
 
@@ -104,12 +107,12 @@ def _consistent(recipe: Recipe) -> Recipe:
 
 
 AnyTest = Annotated[
-    Helix | HelixPoints | Circle | Diagonal | FaceDiagonal | Linear, Field(discriminator="kind"), AfterValidator(_consistent)
+    Helix | HelixPoints | Circle | Diagonal | FaceDiagonal | Linear | ArtefactTest, Field(discriminator="kind"), AfterValidator(_consistent)
 ]
 
 
 class RecipeFile(BaseModel):
-    """Content of a recipe file; ``test``: its tests in the order of measuring."""
+    """Content of a recipe file; ``test``: its tests in the order of measuring; ``artefact``: what is probed, by name."""
 
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
@@ -117,6 +120,11 @@ class RecipeFile(BaseModel):
     name: Annotated[str, Field(min_length=1, max_length=120)]
     note: str = ""
     test: Annotated[list[AnyTest], Field(min_length=1)]
+    artefact: dict[str, ArtefactObject] = Field(default_factory=dict)
+
+    def recipes(self) -> tuple[Recipe, ...]:
+        """Return the tests; those of an artefact with its description."""
+        return tuple(replace(t, plate=self.artefact.get(t.artefact)) if isinstance(t, ArtefactTest) else t for t in self.test)
 
 
 def read_recipe(path: Path) -> tuple[str, tuple[Recipe, ...]]:
@@ -154,7 +162,7 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
         found = RecipeFile.model_validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
         raise _config_error(source, error.errors()) from None
-    return found.name, shared_setups(tuple(found.test), source)
+    return found.name, shared_setups(found.recipes(), source)
 
 
 def _check_keys(content: dict[str, Any], source: str) -> None:
@@ -200,11 +208,19 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
         lines.append(f"note = {_toml(note)}")
     for recipe in recipes:
         lines += ["", "[[test]]", *(f"{key} = {_toml(value)}" for key, value in file_table(recipe).items())]
+    plates = {r.artefact: r.plate for r in recipes if isinstance(r, ArtefactTest) and r.plate is not None}
+    for artefact, plate in plates.items():
+        known = plate.model_dump(by_alias=True, exclude_none=True)
+        lines += ["", f"[artefact.{_toml(artefact)}]", *(f"{key} = {_toml(value)}" for key, value in known.items())]
     text = "\n".join(lines) + "\n"
     parse_recipe(text, f"recipe {name!r}")
     return text
 
 
 def _toml(value: Any) -> str:
-    """Format a TOML value: for text, numbers and their lists JSON is TOML, except the ASCII DEL."""
+    """Format a TOML value: for text, numbers and their lists JSON is TOML, except the ASCII DEL; a list of tables has one per line."""
+    if isinstance(value, dict):
+        return "{ " + ", ".join(f"{_toml(key)} = {_toml(one)}" for key, one in value.items()) + " }"
+    if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
+        return "[\n" + "".join(f"  {_toml(one)},\n" for one in value) + "]"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

@@ -1,0 +1,74 @@
+"""From the touches of a hole or ball to its centre: the only place where latched positions become columns of an artefact's run.
+
+A record of one feature: ``feature``, ``inside`` (a hole), ``nominal_mm`` (artefact axes), ``target_mm`` (axis position expected for its
+centre), ``sides`` (unit vectors from the centre to each touch, machine axes), ``touches_mm`` (for each side the repeated latched axis
+positions), ``start_deg`` (direction of the first touch), ``ctrl_us``, ``feed_mm_min``, ``temperature_C`` where one is known.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.service.domain.measured import RunStart
+from abbe.service.domain.run import Columns
+
+LEAST_U_MM = 1e-5
+ROUNDS = 6
+
+
+@dataclass(frozen=True, slots=True)
+class FoundFeature:
+    """Axis position of the centre (3,), distance of the tip's centre from it at the touches, and spread of a single touch, mm."""
+
+    centre_mm: F1
+    radius_mm: float
+    spread_mm: float
+
+
+def found_feature(record: dict[str, Any]) -> FoundFeature:
+    """Fit a circle (hole; the height stays as expected) or a sphere (ball) to the touches of a feature."""
+    target, sides = np.asarray(record["target_mm"], dtype=np.float64), np.asarray(record["sides"], dtype=np.float64)
+    each = [np.asarray(side, dtype=np.float64) for side in record["touches_mm"]]
+    means, free = np.array([side.mean(axis=0) for side in each]), _free(sides)
+    centre, radius = target.copy(), float(np.einsum("ni,ni->n", means - target, sides).mean())
+    for _ in range(ROUNDS):
+        away = (means - centre) @ free.T
+        distance = np.linalg.norm(away, axis=1)
+        slope = np.column_stack([away / distance[:, None], np.ones(len(away))])
+        step = np.linalg.lstsq(slope, distance - radius, rcond=None)[0]
+        centre, radius = centre + step[:-1] @ free, radius + float(step[-1])
+    left = np.concatenate([(side - mean) @ way for side, mean, way in zip(each, means, sides, strict=True)])
+    degrees = sum(len(side) - 1 for side in each)
+    return FoundFeature(centre, radius, float(np.sqrt(np.sum(left**2) / max(degrees, 1))))
+
+
+def _free(sides: F2) -> F2:
+    """Return the directions in which the touches find the centre, as rows: a plane for a hole, all for a ball."""
+    _, size, rows = np.linalg.svd(sides, full_matrices=False)
+    return np.asarray(rows[size > 0.1 * size[0]])
+
+
+def touch_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+    """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
+
+    ``u_mm`` is the repeatability of a centre: the pooled spread of repeated touches over the root of the touches along one direction.
+    """
+    found = [found_feature(record) for record in records]
+    pose = start.setup["pose"]
+    origin, matrix = np.array(pose["origin_mm"], dtype=np.float64), np.array(pose["matrix"], dtype=np.float64)
+    deviation = [(f.centre_mm - origin) @ matrix - np.array(r["nominal_mm"]) for f, r in zip(found, records, strict=True)]
+    spread = float(np.sqrt(np.mean([f.spread_mm**2 for f in found]))) if found else 0.0
+    doc: dict[str, Any] = {"t_s": [start.since_zero_s(r["ctrl_us"]) for r in records]}
+    doc |= {f"{a}_mm": [round(float(f.centre_mm[k]), 7) for f in found] for k, a in enumerate("xyz")}
+    doc["feature"] = [r["feature"] for r in records]
+    for k, a in enumerate("xyz"):
+        unsensed = [k == 2 and r["inside"] for r in records]
+        doc[f"deviation_{a}_mm"] = [None if u else round(float(d[k]), 7) for d, u in zip(deviation, unsensed, strict=True)]
+    doc["u_mm"] = [max(spread / np.sqrt(2.0 * len(r["touches_mm"][0])), LEAST_U_MM) for r in records]
+    doc |= {"temperature_C": [r.get("temperature_C") for r in records], "touch_start_deg": [r["start_deg"] for r in records]}
+    return Columns.from_document(doc)

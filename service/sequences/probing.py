@@ -1,0 +1,182 @@
+"""Touches one feature of an artefact: protected way there, approach, touch, retract, repeats, and back above it.
+
+Every way between the artefact's features is a touch command, too, so that an unexpected contact stops the axes. Whatever goes wrong with
+the probe, the stylus is taken out first, the way it came.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+from typing import Any
+
+from abbe.drivers.api import Latch, Point, Probing, can_touch
+from abbe.service.errors import ConfigError, FalseTrips, MissedContact, Obstructed, ProbeNotReady, ProbeUncalibrated, SetupDisturbed
+from abbe.service.runs.touches import found_feature
+from abbe.service.sequences.steps import TouchFeature
+
+AGREE_MM = 0.01
+"""Repeated touches of one side agree within this; a trip by vibration does not."""
+MORE_TOUCHES = 3
+RADIUS_MM = 0.05
+"""Allowed difference of the radius that a feature shows from the expected one: pre-travel and a hole's tolerance, but no other stylus."""
+MOVED_MM = 0.01
+"""Allowed change of a feature that is touched again: minutes of drift, but no plate that has slipped."""
+TOUCH_S = 30.0
+SAME_PLACE_MM = 1e-5
+
+
+def need_probe(controller: object) -> Probing:
+    """Return the controller if it can touch. Raises ConfigError."""
+    if not can_touch(controller):
+        raise ConfigError("this control cannot touch: its driver knows no probe input", "find the points there, and use `abbe import`")
+    return controller
+
+
+@dataclass
+class FeatureTouch:
+    """One feature under the probe. ``false_trips``: trips that did not repeat."""
+
+    probe: Probing
+    step: TouchFeature
+    false_trips: int = 0
+    out: list[Point] = field(default_factory=list)
+    """The way out of the feature, last place first to leave."""
+
+    async def run(self) -> dict[str, Any]:
+        """Return the record of the feature (`abbe.service.runs.touches`) without its time.
+
+        Raises
+        ------
+        ProbeNotReady, Obstructed, MissedContact, FalseTrips, ProbeUncalibrated
+            The stylus is above the feature or, if something is in the way, where it stopped.
+        """
+        step = self.step
+        await self._ready()
+        await self._rise()
+        await self._protected(step.above_mm)
+        touches = []
+        for side in step.sides:
+            try:
+                touches.append(await self._side(side))
+            except (MissedContact, FalseTrips):
+                await self._leave()
+                raise
+            if not step.inside:
+                await self._leave()
+        await self._leave()
+        record: dict[str, Any] = {
+            "feature": step.feature, "inside": step.inside, "nominal_mm": list(step.nominal_mm), "target_mm": list(step.centre_mm),
+            "sides": [list(s) for s in step.sides], "touches_mm": touches, "start_deg": step.start_deg,
+            "feed_mm_min": step.touch_feed_mm_min, "false_trips": self.false_trips,
+        }  # fmt: skip
+        self._check_radius(found_feature(record).radius_mm)
+        return record
+
+    async def _ready(self) -> None:
+        state = await self.probe.probe_state()
+        if not state.fitted or state.deflected:
+            what = "the stylus is deflected" if state.fitted else "no touch probe is fitted and ready"
+            remedy = "free it by hand, away from the artefact" if state.fitted else "fit it, look at its battery and its stylus"
+            raise ProbeNotReady(f"feature {self.step.feature}: {what}", f"{remedy}; then resume")
+
+    async def _rise(self) -> None:
+        """Rise to the clear height first: an abort may have left the stylus beside a ball or in a hole."""
+        here, up = (await self.probe.status()).position_mm, self.step.up
+        below = sum((a - h) * u for a, h, u in zip(self.step.above_mm, here, up, strict=True))
+        if below > 0.0:
+            x, y, z = (h + below * u for h, u in zip(here, up, strict=True))
+            await self._protected((x, y, z))
+
+    async def _side(self, side: Point) -> list[list[float]]:
+        """Return the repeated, agreeing touches of one side."""
+        step = self.step
+        if step.inside and not self.out:
+            await self._in((step.above_mm,), step.centre_mm)
+        elif not step.inside:
+            await self._in((step.above_mm, step.over_mm(side)), step.before_mm(side))
+        if step.inside:
+            await self._protected(step.before_mm(side))
+        found: list[Point] = []
+        for _ in range(step.repeats + MORE_TOUCHES):
+            latch = await self._touch(step.beyond_mm(side), step.touch_feed_mm_min)
+            await self._move(step.before_mm(side))
+            if latch is None:
+                raise MissedContact(
+                    f"feature {step.feature}: no contact within {step.search_mm:g} mm of where it was expected",
+                    "is it there, the artefact where stated, the probe's battery good? then resume",
+                )
+            found.append(latch.position_mm)
+            same = [p for p in found if math.dist(p, latch.position_mm) <= AGREE_MM]
+            if len(same) >= step.repeats:
+                self.false_trips += len(found) - len(same)
+                if step.inside:
+                    await self._move(step.centre_mm)
+                return [list(p) for p in same[: step.repeats]]
+        raise FalseTrips(
+            f"feature {step.feature}: {len(found)} touches of one side, of which no {step.repeats} agree within {1e3 * AGREE_MM:.0f} um",
+            "look at the stylus (loose, chipped), at chips on the feature and at the probe's cable or receiver; then resume",
+        )
+
+    async def _in(self, over: tuple[Point, ...], to: Point) -> None:
+        """Go down to a place, and remember the way out."""
+        for place in (*over[1:], to):
+            await self._protected(place)
+        self.out = [*over, to]
+
+    async def _leave(self) -> None:
+        """Take the stylus out the way it came in."""
+        way, self.out = self.out[::-1][1:], []
+        for place in way:
+            await self._protected(place)
+
+    async def _protected(self, target: Point) -> None:
+        """Move where nothing may be touched. After one trip back off and try again: it may have been a false one."""
+        start = (await self.probe.status()).position_mm
+        if math.dist(start, target) < SAME_PLACE_MM:
+            return
+        latch = await self._touch(target, self.step.feed_mm_min)
+        if latch is not None:
+            self.false_trips += 1
+            await self._move(start)
+            latch = await self._touch(target, self.step.feed_mm_min)
+        if latch is None:
+            return
+        await self._move(start)
+        x, y, z = latch.position_mm
+        raise Obstructed(
+            f"feature {self.step.feature}: the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way",
+            "is the artefact as stated (turned by 90 degrees, another, a clamp in the way)? the axes backed off; correct it, then resume",
+        )
+
+    async def _touch(self, target: Point, feed_mm_min: float) -> Latch | None:
+        return await self.probe.touch(target, feed_mm_min=feed_mm_min, timeout_s=TOUCH_S + self._seconds(feed_mm_min))
+
+    async def _move(self, target: Point) -> None:
+        feed = self.step.feed_mm_min
+        await self.probe.move(target, feed_mm_min=feed, timeout_s=TOUCH_S + self._seconds(feed))
+
+    def _seconds(self, feed_mm_min: float) -> float:
+        """Three times the time of the longest way at this feed, for low overrides."""
+        return 3.0 * 60.0 * 500.0 / feed_mm_min
+
+    def _check_radius(self, found_mm: float) -> None:
+        off = found_mm - self.step.radius_mm
+        if abs(off) > RADIUS_MM:
+            raise ProbeUncalibrated(
+                f"feature {self.step.feature}: its radius comes out {abs(off):.3f} mm too {'large' if off > 0.0 else 'small'}",
+                "is this the stated stylus, qualified, and the feature's radius as stated? correct stylus_radius_mm or radius_mm",
+            )
+
+
+def check_unmoved(record: dict[str, Any], earlier: list[dict[str, Any]]) -> None:
+    """Compare a feature with its first touches in the same pose. Raises SetupDisturbed if it is elsewhere now."""
+    before = next((one for one in earlier if one["feature"] == record["feature"]), None)
+    if before is None:
+        return
+    moved = math.dist(found_feature(record).centre_mm, found_feature(before).centre_mm)
+    if moved > MOVED_MM:
+        raise SetupDisturbed(
+            f"feature {record['feature']} lies {1e3 * moved:.0f} um from where it was after {len(earlier)} features: the artefact moved",
+            "its points so far are kept as evidence; it is clamped anew and measured from the beginning",
+        )

@@ -1,0 +1,132 @@
+"""The recipe of an artefact in one pose: every hole or ball touched from all sides, the first one again and again.
+
+The first feature is the reference of the pose: touched again after every ``requalify_every`` features and at the end, it shows whether the
+probe or the artefact has changed meanwhile, and how the pose drifts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import KW_ONLY, dataclass
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field as Limits
+from scipy.spatial.transform import Rotation
+
+from abbe.models.machine import Machine
+from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject, Feature
+from abbe.service.errors import ConfigError
+from abbe.service.sequences.recipes.approach import RAPID_MM_MIN, Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
+from abbe.service.sequences.steps import MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
+
+BALL, HOLE = "xyz", "xy"
+Angle = Annotated[float, Limits(ge=-360.0, le=360.0)]
+Millimetres = Annotated[float, Limits(gt=0.0, le=500.0)]
+
+
+@dataclass(frozen=True, slots=True)
+class ArtefactTest(TestRecipe):
+    """The features of an artefact in one pose.
+
+    ``artefact``: its name under ``[artefact]`` of the file; ``origin_mm``: axis position at which the stylus tip is at its zero;
+    ``rotation_deg``: its turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified. ``depth_mm``: of the touches in a
+    hole below its nominal place; ``clear_mm``: height above the features at which the way is free. ``turned_every``: every so many features
+    the first touch is at 45 degrees instead of 0, which shows the lobing; 0: never.
+    """
+
+    artefact: Name
+    origin_mm: tuple[Coordinate, Coordinate, Coordinate]
+    _: KW_ONLY
+    rotation_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
+    stylus_radius_mm: Millimetres = 3.0
+    depth_mm: Annotated[float, Limits(ge=0.0, le=200.0)] = 6.0
+    clear_mm: Millimetres = 20.0
+    search_mm: Annotated[float, Limits(ge=0.1, le=5.0)] = 0.8
+    repeats: Annotated[int, Limits(ge=2, le=10)] = 2
+    requalify_every: Annotated[int, Limits(ge=2, le=1000)] = 10
+    turned_every: Annotated[int, Limits(ge=0, le=1000)] = 3
+    feed_mm_min: Feed = 3000.0
+    touch_feed_mm_min: Feed = 100.0
+    kind: Literal["artefact"] = "artefact"
+    plate: ArtefactObject | None = inner(None)  # noqa: RUF009 - a field, not a default
+
+    def matrix(self) -> Array:
+        """Columns: the artefact's axes in machine axes."""
+        found: Array = np.round(Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix(), 12) + 0.0
+        return found
+
+    def plan(self, machine: Machine) -> TestPlan:
+        """Return the test with its steps: up, mount, touch every feature and the first one again and again, clear away.
+
+        Raises
+        ------
+        ConfigError
+            The recipe does not describe the artefact, or a feature cannot be touched.
+        """
+        if self.plate is None:
+            raise ConfigError(f"test {self.label}: the recipe has no artefact {self.artefact!r}", f"add a table [artefact.{self.artefact}]")
+        touches = [self._touch(k, f) for k, f in enumerate(self.plate.features)]
+        matrix = self.matrix()
+        steps: list[Step] = [MoveTo(self._aside(touches, machine), RAPID_MM_MIN)]
+        steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *self._order(touches)]
+        if self.unmount:
+            steps.append(Unmount())
+        setup: dict[str, Any] = {
+            "setup_id": self.setup_id, "artefact": self.artefact, "source": "machine-probe",
+            "tool_mm": [float(v) for v in machine.tool_mm], "tool_radius_mm": self.stylus_radius_mm,
+            "pose": {"origin_mm": list(self.origin_mm), "matrix": matrix.tolist()},
+        }  # fmt: skip
+        known = {self.artefact: self.plate.model_dump(by_alias=True, exclude_none=True)}
+        return TestPlan(self.label, ARTEFACT_TEST, self.role, setup, tuple(steps), known)
+
+    def _order(self, touches: list[TouchFeature]) -> Iterator[TouchFeature]:
+        for k, one in enumerate(touches):
+            if k and k % self.requalify_every == 0:
+                yield touches[0]
+            yield one
+        yield touches[0]
+
+    def _aside(self, touches: list[TouchFeature], machine: Machine) -> tuple[float, float, float]:
+        """Where the machine waits for the person: above the first feature, as far away from the artefact as the strokes allow."""
+        up, place = np.array(touches[0].up), np.array(touches[0].above_mm)
+        ends = np.where(up > 0.5, machine.stroke_mm[:, 1], np.where(up < -0.5, machine.stroke_mm[:, 0], place))
+        return as_point(ends)
+
+    def _touch(self, k: int, feature: Feature) -> TouchFeature:
+        if feature.sensed not in (BALL, HOLE) or feature.normal is not None or feature.radius_mm is None:
+            raise ConfigError(
+                f"artefact {self.artefact}, feature {feature.id}: only holes (sensed = 'xy') and balls ('xyz') with radius_mm are touched",
+                "give radius_mm, or find its point otherwise and use `abbe import`",
+            )
+        inside, matrix = feature.sensed == HOLE, self.matrix()
+        radius = feature.radius_mm - self.stylus_radius_mm if inside else feature.radius_mm + self.stylus_radius_mm
+        if radius <= 2.0 * self.search_mm:
+            raise ConfigError(
+                f"artefact {self.artefact}, feature {feature.id}: no room for a stylus of {self.stylus_radius_mm:g} mm radius in this hole",
+                "use a smaller stylus or a smaller search_mm",
+            )
+        up = matrix[:, 2]
+        start = 45.0 if self.turned_every and k % self.turned_every == self.turned_every - 1 else 0.0
+        centre = np.array(self.origin_mm) + matrix @ np.array(feature.nominal_mm) - (self.depth_mm * up if inside else 0.0)
+        clear = self.clear_mm + (self.depth_mm if inside else feature.radius_mm + self.stylus_radius_mm)
+        return TouchFeature(
+            feature.id, feature.nominal_mm, as_point(centre), radius, _sides(up, start, ball=not inside), inside, _vector(up), clear,
+            self.search_mm, self.repeats, self.feed_mm_min, self.touch_feed_mm_min, start,
+        )  # fmt: skip
+
+
+def _sides(up: Array, start_deg: float, *, ball: bool) -> tuple[tuple[float, float, float], ...]:
+    """Return unit vectors to four touches about ``up``, opposite ones in turn, from ``start_deg`` on; of a ball also its top."""
+    first = np.eye(3)[int(np.argmin(np.abs(up)))]
+    first = first - (first @ up) * up
+    first /= np.linalg.norm(first)
+    second = np.cross(up, first)
+    angles = np.deg2rad(start_deg + np.array([0.0, 180.0, 90.0, 270.0]))
+    around = [np.cos(a) * first + np.sin(a) * second for a in angles]
+    return tuple(_vector(side) for side in ([up, *around] if ball else around))
+
+
+def _vector(v: Array) -> tuple[float, float, float]:
+    x, y, z = (np.round(v, 12) + 0.0).tolist()
+    return x, y, z

@@ -1,0 +1,108 @@
+"""What lies on the table: a plate that the probe in the spindle can touch, once the fixture has put both there."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+
+from abbe.simulators.arrays import F
+from abbe.simulators.artefact.body import Mounting, clearance, draw_body, draw_mounting, placed
+from abbe.simulators.artefact.stylus import draw_stylus
+from abbe.simulators.scenario import Scenario
+
+COARSE_MM, FINE_MM = 0.25, 0.01
+CRASH_MM = 1.0
+"""Deeper in the material than this a stylus breaks."""
+OVERTRAVEL_S = 0.002
+"""From the trip to the axes' stop."""
+
+Tip = Callable[[F], F]
+"""Shares (n,) of a straight move, in order, to the places of the stylus tip, (n, 3) mm in workpiece coordinates."""
+
+
+class Table:
+    """Plate and probe. Nothing is there until `mount`."""
+
+    def __init__(self, scenario: Scenario, tool_mm: F) -> None:
+        self._config, self._seed, self._tool_mm = scenario.artefact, scenario.seed, tool_mm
+        self.body = draw_body(scenario.artefact, scenario.seed)
+        self.stylus = draw_stylus(scenario.probe, scenario.seed)
+        self.quarters = 0
+        """Quarter turns by which the next mounting is wrong (tests)."""
+        self.temperature_c = 20.0
+        self._mounting: Mounting | None = None
+        self._count = 0
+
+    @property
+    def fitted(self) -> bool:
+        """Whether the probe is in the spindle, and whole."""
+        return self._mounting is not None and not self.stylus.broken
+
+    def mount(self, origin_mm: F, matrix: F, time_s: float) -> None:
+        """Put the plate at the axis position ``origin_mm`` of its zero, its axes along the columns of ``matrix``, and fit the probe."""
+        self._count += 1
+        self.stylus.broken = False
+        origin = origin_mm + self._tool_mm
+        if self.quarters:
+            origin, matrix = self._turned(origin, matrix)
+        self._mounting = draw_mounting(self._config, self._seed, self._count, (origin, matrix), time_s)
+
+    def unmount(self) -> None:
+        """Take plate and probe away."""
+        self._mounting = None
+
+    def move(self, by_mm: F) -> None:
+        """Let the plate slip (tests)."""
+        if self._mounting is not None:
+            self._mounting = replace(self._mounting, origin_mm=self._mounting.origin_mm + by_mm)
+
+    def deflected(self, tip_mm: F, time_s: float) -> bool:
+        """Whether the stylus is pushed aside at a place of its tip (3,)."""
+        return bool(self.fitted and self._free(tip_mm[None, :], time_s)[0] < -0.5 * self.stylus.pretravel_mm)
+
+    def contact(self, length_mm: float, way: F, tip: Tip, time_s: float) -> float | None:
+        """Return the length of a straight move, mm, after which the probe trips; None: it does not. ``way``: unit vector of the move."""
+        if not self.fitted:
+            return None
+        if self.stylus.false_trips:
+            self.stylus.false_trips -= 1
+            return float(self.stylus.rng.uniform(0.2, 0.8)) * length_mm
+        found = self._first_below(-self.stylus.trip_depth(way), length_mm, tip, time_s)
+        if found is not None and self.stylus.missed:
+            self.stylus.missed -= 1
+            return None
+        return found
+
+    def crash(self, length_mm: float, tip: Tip, time_s: float) -> float | None:
+        """Return the length of a straight move, mm, after which the stylus breaks; None: it does not."""
+        return self._first_below(-CRASH_MM, length_mm, tip, time_s) if self.fitted else None
+
+    def _first_below(self, level_mm: float, length_mm: float, tip: Tip, time_s: float) -> float | None:
+        """Return where on a move the free way first falls below a level, found on a coarse grid and refined near it."""
+        coarse = np.linspace(0.0, 1.0, max(2, int(np.ceil(length_mm / COARSE_MM)) + 1))
+        free = self._free(tip(coarse), time_s)
+        if free[0] < level_mm:
+            return None if free[-1] > free[0] else 0.0  # it backs out
+        near = np.flatnonzero(np.minimum(free[:-1], free[1:]) < level_mm + COARSE_MM)
+        for k in near:
+            fine = np.linspace(coarse[k], coarse[k + 1], int(COARSE_MM / FINE_MM) + 1)
+            shares = np.concatenate([coarse[:k], fine])
+            values = self._free(tip(shares), time_s)[k:] - level_mm
+            below = np.flatnonzero(values < 0.0)
+            if below.size:
+                i = int(below[0])
+                share = fine[i] if i == 0 else fine[i - 1] + (fine[i] - fine[i - 1]) * values[i - 1] / (values[i - 1] - values[i])
+                return float(share) * length_mm
+        return None
+
+    def _free(self, tip_mm: F, time_s: float) -> F:
+        assert self._mounting is not None
+        centres = placed(self.body, self._mounting, time_s, self.temperature_c)
+        return clearance(self.body, self._mounting, centres, tip_mm, self.stylus.radius_mm)
+
+    def _turned(self, origin_mm: F, matrix: F) -> tuple[F, F]:
+        """Turn the plate about its own centre."""
+        middle = self.body.nominal_mm.mean(axis=0)
+        quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+        turn = np.linalg.matrix_power(quarter, self.quarters)
+        return origin_mm + matrix @ (middle - turn @ middle), matrix @ turn
