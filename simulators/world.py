@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.simulators.arrays import F
-from abbe.simulators.artefact.table import OVERTRAVEL_S, Table
+from abbe.simulators.artefact.table import OVERTRAVEL_S, PlateUnderProbe
 from abbe.simulators.ballbar.device import BallbarDevice
 from abbe.simulators.cnc.device import ALARM_CRASH, NOTHING, Controller, Felt
 from abbe.simulators.hidden.live import live_of
@@ -41,7 +41,7 @@ class World:
         if self.hidden is not None:
             self.laser.too_much = self.hidden.laser_mm
             self.ballbar.too_much = self.hidden.bar_mm
-        self.table = Table(scenario, geometry.tool_mm)
+        self.table = PlateUnderProbe(scenario, geometry.tool_mm)
         self.controller.feel = self._felt
         self.controller.probe_fitted = lambda: self.table.fitted
         self.controller.deflected = lambda: self.table.fitted and self.table.deflected(self.tool_position(), self.time_s)

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.simulators.arrays import F
-from abbe.simulators.artefact.body import Mounting, clearance, draw_body, draw_mounting, placed
+from abbe.simulators.artefact.plate import Mounting, clearance, draw_mounting, draw_plate, placed
 from abbe.simulators.artefact.stylus import draw_stylus
 from abbe.simulators.scenario import Scenario
 
@@ -20,12 +20,12 @@ Tip = Callable[[F], F]
 """Shares (n,) of a straight move, in order, to the places of the stylus tip, (n, 3) mm in workpiece coordinates."""
 
 
-class Table:
+class PlateUnderProbe:
     """Plate and probe. Nothing is there until `mount`."""
 
     def __init__(self, scenario: Scenario, tool_mm: F) -> None:
         self._config, self._seed, self._tool_mm = scenario.artefact, scenario.seed, tool_mm
-        self.body = draw_body(scenario.artefact, scenario.seed)
+        self.body = draw_plate(scenario.artefact, scenario.seed)
         self.stylus = draw_stylus(scenario.probe, scenario.seed)
         self.quarters = 0
         """Quarter turns by which the next mounting is wrong (tests)."""

@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from abbe.simulators.artefact.body import placed
+from abbe.simulators.artefact.plate import placed
 from abbe.simulators.cnc.device import ALARM_CRASH, Result
 from abbe.simulators.scenario import ArtefactConfig, Magnitudes, ProbeConfig, Scenario
 from abbe.simulators.world import World

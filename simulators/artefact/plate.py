@@ -20,7 +20,7 @@ BALL_HEIGHT_MM = 25.0
 
 
 @dataclass(frozen=True, slots=True)
-class Body:
+class Plate:
     """The plate at 20 °C: ids and nominal places (n, 3), deviation of the true places (n, 3), radius of each hole or ball."""
 
     kind: str
@@ -48,7 +48,7 @@ class Body:
         return {"kind": self.kind, "features": features, "expansion_per_K": self.expansion_per_k, "calibrated_lengths": [length]}
 
 
-def draw_body(config: ArtefactConfig, seed: int) -> Body:
+def draw_plate(config: ArtefactConfig, seed: int) -> Plate:
     """Draw the true plate of a scenario."""
     rng = generator(seed, STREAM_FORM)
     at = [(i, j) for j in range(config.rows) for i in range(config.columns)]
@@ -58,7 +58,7 @@ def draw_body(config: ArtefactConfig, seed: int) -> Body:
     form = config.form_um * UM * rng.standard_normal(nominal.shape)
     if config.kind == HOLES:
         form[:, 2] = 0.0
-    return Body(config.kind, ids, nominal, form, config.radius_mm, config.expansion_ppm * 1e-6)
+    return Plate(config.kind, ids, nominal, form, config.radius_mm, config.expansion_ppm * 1e-6)
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,7 +84,7 @@ def draw_mounting(config: ArtefactConfig, seed: int, number: int, pose: tuple[F,
     return Mounting(origin + shift, left @ right @ matrix, since_s, drift, config.clamping_um * UM * rng.standard_normal((2, 3)))
 
 
-def placed(body: Body, mounting: Mounting, time_s: float, temperature_c: float) -> F:
+def placed(body: Plate, mounting: Mounting, time_s: float, temperature_c: float) -> F:
     """Return the true centres of all features in workpiece coordinates, (n, 3) mm."""
     true = body.nominal_mm + body.form_mm
     u, v = true[:, 0] / 100.0, true[:, 1] / 100.0
@@ -95,7 +95,7 @@ def placed(body: Body, mounting: Mounting, time_s: float, temperature_c: float) 
     return lies
 
 
-def clearance(body: Body, mounting: Mounting, centres_mm: F, at_mm: F, radius_mm: float) -> F:
+def clearance(body: Plate, mounting: Mounting, centres_mm: F, at_mm: F, radius_mm: float) -> F:
     """Return the free way of a sphere of this radius at n places, (n, 3) mm in workpiece coordinates, to the material; negative: inside."""
     own = (at_mm - mounting.origin_mm) @ mounting.matrix
     features = (centres_mm - mounting.origin_mm) @ mounting.matrix
