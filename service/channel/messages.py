@@ -170,71 +170,63 @@ class WebHeartbeat:
     kind: Literal["alive"]
 
 
-@dataclass(frozen=True, slots=True)
-class StartJob:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WebRequest:
+    """A request to the core, and the account that makes it. The core answers with the same number ``request``."""
+
+    __pydantic_config__ = _STRICT
+    request: Number
+    who: Word
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StartJob(WebRequest):
     """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job."""
 
-    __pydantic_config__ = _STRICT
-    kind: Literal["start"]
-    request: Number
+    kind: Literal["start"] = "start"
     recipe: Word
     key: Word
-    who: Word
 
 
-@dataclass(frozen=True, slots=True)
-class SteerJob:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SteerJob(WebRequest):
     """Stop, abort, pause or resume a running job."""
 
-    __pydantic_config__ = _STRICT
-    kind: Literal["steer"]
-    request: Number
+    kind: Literal["steer"] = "steer"
     job: Word
     how: Steering
-    who: Word
 
 
-@dataclass(frozen=True, slots=True)
-class ConfirmPrompt:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ConfirmPrompt(WebRequest):
     """Confirm a job's prompt with the number ``prompt``: its manual task is done. Refused if another prompt is open."""
 
-    __pydantic_config__ = _STRICT
-    kind: Literal["hand"]
-    request: Number
+    kind: Literal["hand"] = "hand"
     job: Word
     prompt: Number
-    who: Word
 
 
-FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | Answer
-
-
-@dataclass(frozen=True, slots=True)
-class RollBack:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RollBack(WebRequest):
     """Replace the table in force, identified by its push and CRC, by the table before it. ``key``: a repeated key is the same order."""
 
-    __pydantic_config__ = _STRICT
-    kind: Literal["rollback"]
-    request: Number
+    kind: Literal["rollback"] = "rollback"
     push: Number
     crc: Annotated[int, Field(ge=0, le=2**32 - 1)]
     reason: Annotated[str, Field(min_length=1, max_length=500)]
     key: Word
-    who: Word
 
 
-@dataclass(frozen=True, slots=True)
-class PushNow:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PushNow(WebRequest):
     """Push a proposal with a valid approval now. ``key``: a repeated key is the same order."""
 
-    __pydantic_config__ = _STRICT
-    kind: Literal["push"]
-    request: Number
+    kind: Literal["push"] = "push"
     proposal: Number
     key: Word
-    who: Word
 
 
+FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | Answer
 CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow
 """Requests that the core answers with an `Answer`."""
 FromWeb = Serving | WebHeartbeat | CoreRequest

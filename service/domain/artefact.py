@@ -6,12 +6,11 @@ from typing import Annotated, Literal, Self
 
 from pydantic import AfterValidator, Field, model_validator
 
-from abbe.service.domain.machine import FileObject, MachineObject, Point
+from abbe.service.domain.machine import FileObject, Name, Point, RunFileHead
 
 ARTEFACT_TEST = "artefact_points"
 SQUARE = 1e-6
 """A stated matrix is a rotation to this accuracy (components)."""
-Name = Annotated[str, Field(min_length=1, max_length=200)]
 
 
 def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, Point]:
@@ -114,14 +113,9 @@ class PointColumns(FileObject):
     valid: list[Literal[0, 1]] | None = None
 
 
-class ArtefactRunFile(FileObject):
+class ArtefactRunFile(RunFileHead):
     """One run of an artefact's points (``abbe-run/1``, test ``artefact_points``)."""
 
-    format: Literal["abbe-run/1"]
-    campaign: Name
-    run_id: Name
     test: Literal["artefact_points"]
-    role: Literal["identify", "holdout", "sealed"]
-    machine: MachineObject
     setup: ArtefactSetupObject
     columns: PointColumns

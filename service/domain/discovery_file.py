@@ -6,6 +6,7 @@ from typing import Literal
 
 from pydantic import Field
 
+from abbe.models.discovery.answer import Fitted
 from abbe.service.domain.machine import FileObject
 
 Adds = Literal[
@@ -86,16 +87,6 @@ class FoundUnseen(FileObject):
     adds: Adds
 
 
-class FoundFitted(FileObject):
-    """A parameter of the present simulation that a test of one axis measures: its ``scale`` in um/m, with standard uncertainty."""
-
-    name: str
-    key: str
-    value: float
-    u: float
-    unit: str
-
-
 class FoundThinning(FileObject):
     """Decimation: long ball-bar runs were searched with fewer values than readings; effects that this hides may be present."""
 
@@ -130,7 +121,7 @@ class DiscoveryFile(FileObject):
     next_test: FoundTest | None = None
     agreement: list[FoundAgreement] = Field(default_factory=list)
     unseen: list[FoundUnseen] = Field(default_factory=list)
-    fitted: list[FoundFitted] = Field(default_factory=list)
+    fitted: list[Fitted] = Field(default_factory=list)
     doubt: str = ""
     thinning: FoundThinning | None = None
     rms_before_um: float | None = Field(None, ge=0)

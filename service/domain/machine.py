@@ -11,6 +11,9 @@ from urllib.parse import parse_qs, urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
+Name = Annotated[str, Field(min_length=1, max_length=200)]
+Role = Literal["identify", "holdout", "sealed"]
+
 
 def check_chain(text: str) -> str:
     """Return a valid kinematic chain, e.g. ``"w-X-Y-b-Z-t"``.
@@ -79,6 +82,16 @@ class MachineObject(FileObject):
     stroke_mm: Strokes
     pivots_mm: Pivots | None = None
     tool_mm: Point | None = None
+
+
+class RunFileHead(FileObject):
+    """What every run states, of an instrument or of an artefact (``abbe-run/1``)."""
+
+    format: Literal["abbe-run/1"]
+    campaign: Name
+    run_id: Name
+    role: Role
+    machine: MachineObject
 
 
 UNIT = "1"

@@ -8,20 +8,18 @@ from pydantic import ConfigDict, Field, model_validator
 
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
-from abbe.service.domain.machine import FileObject, Interval, MachineObject, Point
+from abbe.service.domain.machine import FileObject, Interval, MachineObject, Name, Point, Role, RunFileHead
 
 RUN_FORMAT = "abbe-run/1"
 CAMPAIGN_FORMAT = "abbe-campaign/1"
 ERRORS_FORMAT = "abbe-errors/1"
 
 Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
-Role = Literal["identify", "holdout", "sealed"]
 Known = Literal["rigid6", "rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"]
 """Effects that a campaign may state for the present simulation of its machine."""
 ASSUMED_MODEL: tuple[Known, ...] = ("rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt")
 """Effects that are assumed if a campaign states none. A stated empty list means: only linear errors and squareness."""
 Numbers = list[float]
-Name = Annotated[str, Field(min_length=1, max_length=200)]
 FileName = Annotated[str, Field(pattern=r"^[^/\\\x00]+\.json$")]
 """A plain file of the same folder: a campaign must not reach files elsewhere."""
 
@@ -80,15 +78,10 @@ class ColumnsObject(FileObject):
     valid: list[Literal[0, 1]] | None = None
 
 
-class RunFile(FileObject):
+class RunFile(RunFileHead):
     """One measured sequence (``abbe-run/1``)."""
 
-    format: Literal["abbe-run/1"]
-    campaign: Name
-    run_id: Name
     test: Test
-    role: Role
-    machine: MachineObject
     setup: SetupObject
     columns: ColumnsObject
 

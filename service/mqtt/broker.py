@@ -7,10 +7,20 @@ the topic ``{prefix}/{machine}/state`` are retained.
 from __future__ import annotations
 
 import ssl
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 from urllib.parse import unquote, urlsplit
 
 from abbe.service.errors import ConfigError
+
+
+@dataclass(frozen=True, slots=True)
+class TlsFiles:
+    """PEM files of an encrypted connection: of the authority that signed the broker's certificate (empty: those that this computer trusts),
+    and the client's certificate with its key, if the broker requires one."""
+
+    ca: str = ""
+    certificate: str = ""
+    key: str = ""
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,10 +35,6 @@ class Broker:
         User name, if the broker requires one.
     password : str or None
         Never shown in a ``repr`` or in an error.
-    ca : str
-        PEM file of the authority that signed the broker's certificate; empty: those that this computer trusts.
-    certificate, key : str
-        PEM files of the client's certificate, if the broker requires one; empty: none.
     """
 
     host: str
@@ -36,9 +42,7 @@ class Broker:
     tls: bool = False
     username: str | None = None
     password: str | None = None
-    ca: str = ""
-    certificate: str = ""
-    key: str = ""
+    files: TlsFiles = TlsFiles()
 
     def __repr__(self) -> str:
         return f"Broker({self})"
@@ -57,13 +61,13 @@ class Broker:
         if not self.tls:
             return None
         try:
-            context = ssl.create_default_context(cafile=self.ca or None)
+            context = ssl.create_default_context(cafile=self.files.ca or None)
             context.minimum_version = ssl.TLSVersion.TLSv1_2
-            if self.certificate:
-                context.load_cert_chain(self.certificate, self.key, password="")
+            if self.files.certificate:
+                context.load_cert_chain(self.files.certificate, self.files.key, password="")
         except OSError as trouble:  # ssl.SSLError is one
             why = trouble.strerror or str(trouble)
-            files = ", ".join(name for name in (self.ca, self.certificate, self.key) if name)
+            files = ", ".join(name for name in astuple(self.files) if name)
             raise ConfigError(
                 f"[mqtt] ca, certificate, key ({files}): {why}", "give PEM files; certificate and key belong together"
             ) from None

@@ -12,8 +12,9 @@ from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, at_rest, driven, since_reversal
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.machine import Machine
+from abbe.service.domain.machine import Role
 from abbe.service.domain.run import BarSetup, LaserSetup, Run
-from abbe.service.domain.run_file import ASSUMED_MODEL, Role
+from abbe.service.domain.run_file import ASSUMED_MODEL
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.observations import with_reversals
 

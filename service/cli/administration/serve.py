@@ -145,13 +145,13 @@ def _summary(site: Site) -> MachineSummary:
 def _broker(loaded: LoadedMachine) -> Broker | None:
     from dataclasses import replace
 
-    from abbe.service.mqtt.broker import parse
+    from abbe.service.mqtt.broker import TlsFiles, parse
 
     mqtt = loaded.machine.mqtt
     if mqtt.url is None:
         return None
-    ca, certificate, key = (_beside(loaded.path, name) for name in (mqtt.ca, mqtt.certificate, mqtt.key))
-    broker = replace(parse(mqtt.url), ca=ca, certificate=certificate, key=key)
+    files = TlsFiles(*(_beside(loaded.path, name) for name in (mqtt.ca, mqtt.certificate, mqtt.key)))
+    broker = replace(parse(mqtt.url), files=files)
     broker.tls_context()  # fail now rather than at every attempt to connect
     return broker
 

@@ -154,24 +154,24 @@ class CoreLine:
     async def start(self, recipe: str, key: str, who: str) -> Answer:
         """Start a job. Raises CoreSilent if no answer comes: then the outcome is unknown; repeat the request with the same key."""
         number = next(self._numbers)
-        return await self._ask(StartJob("start", number, recipe, key, who))
+        return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who))
 
     async def steer(self, job: str, how: Steering, who: str) -> Answer:
         """Stop, abort, pause or resume a running job. Raises CoreSilent if no answer comes."""
         number = next(self._numbers)
-        return await self._ask(SteerJob("steer", number, job, how, who))
+        return await self._ask(SteerJob(request=number, job=job, how=how, who=who))
 
     async def confirm_prompt(self, job: str, prompt: int, who: str) -> Answer:
         """Confirm that a person has done what a prompt of a job asks. Raises CoreSilent if no answer comes."""
-        return await self._ask(ConfirmPrompt("hand", next(self._numbers), job, prompt, who))
+        return await self._ask(ConfirmPrompt(request=next(self._numbers), job=job, prompt=prompt, who=who))
 
     async def roll_back(self, push: int, crc: int, reason: str, key: str, who: str) -> Answer:
         """Replace the table in force, given by push and CRC, by the one before it. Raises CoreSilent as `start` does."""
-        return await self._ask(RollBack("rollback", next(self._numbers), push, crc, reason, key, who))
+        return await self._ask(RollBack(request=next(self._numbers), push=push, crc=crc, reason=reason, key=key, who=who))
 
     async def push(self, proposal: int, key: str, who: str) -> Answer:
         """Push an approved proposal now. Raises CoreSilent as `start` does."""
-        return await self._ask(PushNow("push", next(self._numbers), proposal, key, who))
+        return await self._ask(PushNow(request=next(self._numbers), proposal=proposal, key=key, who=who))
 
     async def _ask(self, request: CoreRequest) -> Answer:
         self.snapshot()

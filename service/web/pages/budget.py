@@ -37,13 +37,11 @@ class SourceLine:
 
 @dataclass(frozen=True, slots=True)
 class IntervalLine:
-    """One result: estimate, U, the interval's ends, unit."""
+    """One result: estimate and U, the interval's ends, unit."""
 
     name: str
-    value: str
-    expanded: str
-    low: str
-    high: str
+    shown: tuple[str, str]
+    ends: tuple[str, str]
     unit: str
 
 
@@ -113,13 +111,13 @@ def _mean(name: str, m: MeanValue) -> IntervalLine:
 
 def _interval(name: str, value: float, expanded: float, unit: str) -> IntervalLine:
     frame = current()
-    shown, half = frame.with_u(value, expanded / COVERAGE, unit)
+    shown = frame.with_u(value, expanded / COVERAGE, unit)
     if not (finite(value) and finite(expanded)):
-        return IntervalLine(name, shown, half, NOT_AVAILABLE, NOT_AVAILABLE, frame.unit(unit))
+        return IntervalLine(name, shown, (NOT_AVAILABLE, NOT_AVAILABLE), frame.unit(unit))
     # The ends have the resolution of U: with U = 470, tens.
-    decimals = 1 - math.floor(math.log10(float(half))) if expanded > 0.0 else 0
+    decimals = 1 - math.floor(math.log10(float(shown[1]))) if expanded > 0.0 else 0
     low, high = (fixed(end / frame.drawn(unit).size, decimals) for end in (value - expanded, value + expanded))
-    return IntervalLine(name, shown, half, low, high, frame.unit(unit))
+    return IntervalLine(name, shown, (low, high), frame.unit(unit))
 
 
 def _trials(trials: MonteCarloCheck | None) -> list[tuple[str, str, str, str]]:

@@ -42,12 +42,11 @@ LOOK_BACK = 200
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """A figure in the reader's words and units; ``change``: value and U of its change since the last good check, None without one."""
+    """A figure in the reader's words and units, as value and U; ``change``: that since the last good check, None without one."""
 
     name: str
     unit: str
-    value: str
-    u: str
+    shown: tuple[str, str]
     limit: str
     verdict: str
     picture: Markup
@@ -117,14 +116,14 @@ def check_screen(reader: Reader, number: int) -> CheckScreen:
 def _gauge(check: Verification, figure: CheckFigure, good: Verification | None) -> Gauge:
     frame, value = current(), figure.value or 0.0
     name, unit = language.figure(frame.lang, figure.name)
-    told, u = frame.with_u(value, None if figure.expanded is None else figure.expanded / 2.0, unit)
+    shown = frame.with_u(value, None if figure.expanded is None else figure.expanded / 2.0, unit)
     limit = "–" if figure.limit is None else frame.length(f"{figure.limit:g}", unit)
-    words = {"name": name, "value": told, "u": u, "unit": frame.unit(unit), "limit": limit}
+    words = {"name": name, "value": shown[0], "u": shown[1], "unit": frame.unit(unit), "limit": limit}
     title = frame.translate("check.gauge.open" if figure.limit is None else "check.gauge", **words)
     drawn = [None if v is None else converted(v, unit, frame.units) for v in (value, figure.expanded, figure.limit)]
     verdict = figure_verdict(check, figure.name) if figure.limit is not None else ""
     picture = Markup(gauge_svg(title, drawn[0] or 0.0, drawn[1], drawn[2], verdict or "plain"))  # noqa: S704 - our own writer, which escapes
-    return Gauge(name, frame.unit(unit), told, u, limit, verdict, picture, _change(figure, good, unit))
+    return Gauge(name, frame.unit(unit), shown, limit, verdict, picture, _change(figure, good, unit))
 
 
 def _change(figure: CheckFigure, good: Verification | None, unit: str) -> tuple[str, str] | None:

@@ -84,13 +84,9 @@ class Diagnosis:
     python: str
     system: str
     database: str
-    revision: str
-    wanted_revision: str
-    size_b: int
-    since_utc: str | None
+    health: StoreHealth
     growth_b: float | None
     free_b: int | None
-    outbox: int
     outbox_oldest_s: float | None
 
     @property
@@ -101,7 +97,7 @@ class Diagnosis:
     @property
     def current(self) -> bool:
         """Whether the database has this program's schema."""
-        return self.revision == self.wanted_revision
+        return self.health.revision == self.health.wanted_revision
 
 
 def diagnosis(sources: Sources, version: str) -> Diagnosis:
@@ -112,10 +108,8 @@ def diagnosis(sources: Sources, version: str) -> Diagnosis:
     days = 0.0 if since is None else (now - since).total_seconds() / DAY_S
     oldest = None if found.outbox_oldest_utc is None else (now - datetime.fromisoformat(found.outbox_oldest_utc)).total_seconds()
     free = shutil.disk_usage(Path(found.file).parent).free if found.file else None
-    return Diagnosis(
-        version, platform.python_version(), platform.platform(), store.url, found.revision, found.wanted_revision, found.size_b,
-        found.since_utc, found.size_b / days if days >= 1.0 else None, free, found.outbox, oldest,
-    )  # fmt: skip
+    growth_b = found.size_b / days if days >= 1.0 else None
+    return Diagnosis(version, platform.python_version(), platform.platform(), store.url, found, growth_b, free, oldest)
 
 
 def megabytes(size_b: float) -> str:

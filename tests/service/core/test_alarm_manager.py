@@ -113,7 +113,7 @@ class Bench:
     async def steer(self, how: Steering, who: str = "user:bob") -> tuple[str, str]:
         running = self.book.running
         assert running is not None
-        answer = await self.book.steer(SteerJob("steer", 1, running.id, how, who))
+        answer = await self.book.steer(SteerJob(request=1, job=running.id, how=how, who=who))
         return answer.outcome, answer.text
 
     def alarm(self) -> Alarm:

@@ -61,13 +61,13 @@ class Bench:
 
     async def start(self, recipe: str = "quick-check", key: str = "", who: str = "user:bob") -> Answer:
         self.numbers += 1
-        answer = await self.book.start(StartJob("start", self.numbers, recipe, key, who))
+        answer = await self.book.start(StartJob(request=self.numbers, recipe=recipe, key=key, who=who))
         assert answer.request == self.numbers
         await settle()
         return answer
 
     async def steer(self, job: str, how: Steering, who: str = "user:bob") -> str:
-        answer = await self.book.steer(SteerJob("steer", 1, job, how, who))
+        answer = await self.book.steer(SteerJob(request=1, job=job, how=how, who=who))
         await settle()
         return answer.outcome
 

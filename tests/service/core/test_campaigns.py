@@ -82,7 +82,7 @@ class Bench:
         return self.end
 
     async def start(self, recipe: str = "identification", key: str = "", who: str = "token:bob/ci") -> Answer:
-        answer = await self.book.start(StartJob("start", 1, recipe, key, who))
+        answer = await self.book.start(StartJob(request=1, recipe=recipe, key=key, who=who))
         if answer.outcome == "done":
             await self.until(lambda: self.book.latest()[0].prompt or self.book.latest()[0].ended_utc is not None)
         return answer
@@ -96,12 +96,12 @@ class Bench:
                 await settle()
 
     async def done(self, job: str, prompt: int, who: str = "token:bob/ci") -> str:
-        answer = await self.book.done_by_hand(ConfirmPrompt("hand", 1, job, prompt, who))
+        answer = await self.book.done_by_hand(ConfirmPrompt(request=1, job=job, prompt=prompt, who=who))
         await settle()
         return answer.outcome
 
     async def steer(self, job: str, how: Steering) -> str:
-        return (await self.book.steer(SteerJob("steer", 1, job, how, "token:bob/ci"))).outcome
+        return (await self.book.steer(SteerJob(request=1, job=job, how=how, who="token:bob/ci"))).outcome
 
     async def ended(self) -> JobState:
         await self.until(lambda: self.book.latest()[0].ended_utc is not None)

@@ -106,11 +106,11 @@ CORE = [
 WEB = [
     m.Serving("up", 1),
     m.WebHeartbeat("alive"),
-    m.StartJob("start", 1, "quick-check", "k", "user:bob"),
-    m.SteerJob("steer", 2, "0" * 12, "pause", "x"),
-    m.ConfirmPrompt("hand", 3, "0" * 12, 2, "user:bob"),
-    m.RollBack("rollback", 3, 7, 0xFFFFFFFF, "worse since then", "k", "user:ann"),
-    m.PushNow("push", 4, 3, "k", "user:ann"),
+    m.StartJob(request=1, recipe="quick-check", key="k", who="user:bob"),
+    m.SteerJob(request=2, job="0" * 12, how="pause", who="x"),
+    m.ConfirmPrompt(request=3, job="0" * 12, prompt=2, who="user:bob"),
+    m.RollBack(request=3, push=7, crc=0xFFFFFFFF, reason="worse since then", key="k", who="user:ann"),
+    m.PushNow(request=4, proposal=3, key="k", who="user:ann"),
 ]
 
 
@@ -149,12 +149,12 @@ def test_a_message_that_lacks_or_adds_something_is_refused(message: Any) -> None
 @pytest.mark.parametrize(
     "message",
     [
-        m.StartJob("start", 1, "x" * 201, "", "user:bob"),
-        m.StartJob("start", -1, "x", "", "user:bob"),
-        m.SteerJob("steer", 1, "0", "fly", "x"),  # type: ignore[arg-type]
-        m.RollBack("rollback", 1, 7, 2**32, "worse", "k", "user:ann"),
-        m.RollBack("rollback", 1, 7, 1, "", "k", "user:ann"),
-        m.RollBack("rollback", 1, 7, 1, "x" * 501, "k", "user:ann"),
+        m.StartJob(request=1, recipe="x" * 201, key="", who="user:bob"),
+        m.StartJob(request=-1, recipe="x", key="", who="user:bob"),
+        m.SteerJob(request=1, job="0", how="fly", who="x"),  # type: ignore[arg-type]
+        m.RollBack(request=1, push=7, crc=2**32, reason="worse", key="k", who="user:ann"),
+        m.RollBack(request=1, push=7, crc=1, reason="", key="k", who="user:ann"),
+        m.RollBack(request=1, push=7, crc=1, reason="x" * 501, key="k", who="user:ann"),
         replace(MOMENT, core_rss_bytes=2**63),
         replace(MOMENT, check=replace(MOMENT.check, done=float("nan"))),  # type: ignore[type-var]
         replace(MOMENT, attention=("x" * 4000,) * 21),

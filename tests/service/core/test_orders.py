@@ -83,7 +83,7 @@ class Bench:
         return self.said
 
     async def ask(self, who: str = "user:ann", push: int = 1, image: bytes = NEW, reason: str = "worse", key: str = "") -> Answer:
-        answer = await self.orders.rollback(RollBack("rollback", 7, push, crc32(image), reason, key, who))
+        answer = await self.orders.rollback(RollBack(request=7, push=push, crc=crc32(image), reason=reason, key=key, who=who))
         assert answer.request == 7
         return answer
 
@@ -172,7 +172,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
 
 async def test_nothing_comes_between_two_jobs(bench: Bench) -> None:
     await bench.push({}, OLD, NEW, KEPT)
-    assert (await bench.book.start(StartJob("start", 1, "quick-check", "", "user:bob"))).outcome == "done"
+    assert (await bench.book.start(StartJob(request=1, recipe="quick-check", key="", who="user:bob"))).outcome == "done"
     await settle()
     answer = await bench.ask()
     assert (answer.outcome, answer.text) == ("busy", "the machine is in use: quick-check")

@@ -55,7 +55,7 @@ key = "{own.key_pem.name}"
 clients = ["{own.pem.name}"]
 """,
     )
-    assert (made.broker.port, made.broker.ca) == (8883, str(ca.pem))
+    assert (made.broker.port, made.broker.files.ca) == (8883, str(ca.pem))
     assert made.opcua.clients == (str(own.pem),)
     assert (made.opcua.exposed, made.opcua.port, made.opcua.key) == (True, 4841, str(own.key_pem))
 

@@ -146,7 +146,7 @@ async def test_it_is_started_from_the_checklist(desk: Desk, plant: Plant) -> Non
     assert 'id="start"' not in await desk.page(f"/new?recipe={CAMPAIGN}", plant.session("viewer"))
     sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": 500}, headers=who | {"Idempotency-Key": "k"})
     assert sent.status_code == 202
-    assert desk.asked[-1] == StartJob("start", desk.asked[-1].request, f"{CAMPAIGN} at 500 Hz", "k", "user:a-metrologist")
+    assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=f"{CAMPAIGN} at 500 Hz", key="k", who="user:a-metrologist")
 
 
 async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) -> None:

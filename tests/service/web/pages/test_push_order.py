@@ -63,7 +63,7 @@ class Bench:
         return JobOutcome("kept", "all is well")
 
     async def ask(self, number: int, who: str = "user:anna", key: str = "") -> Answer:
-        return await self.orders.push(PushNow("push", 1, number, key, who))
+        return await self.orders.push(PushNow(request=1, proposal=number, key=key, who=who))
 
     async def ended(self) -> JobState:
         async with asyncio.timeout(within(10)):
