@@ -9,7 +9,7 @@ import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, timedelta
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.service_records import AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind, Signal
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
@@ -45,7 +45,6 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.users.people import Passwords, UserAccounts
-from abbe.service.verification.alarm_states import Signal
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.logtail import LogTail
@@ -170,12 +169,12 @@ def add_alarms(store: Store, machine: str, schedule: Schedule, proposal: int, ev
     values = check.doc["values"]
     signals = [Signal("body_diagonal_um", "limit", values["body_diagonal_um"], 1.1, 20.0, f"worst body diagonal is above its limit{evil}"),
                Signal("helix_rms_um", "jump", values["helix_rms_um"], 0.2, 5.0, "helix rms differs", 2.1, 0.1)]  # fmt: skip
-    head = {"recipe": schedule.recipe, "schedule": schedule.name, "verification": check.id, "text": f"above its limit{evil}"}
+    head = AlarmFacts(recipe=schedule.recipe, schedule=schedule.name, verification=check.id, text=f"above its limit{evil}")
     for number, kinds in ((1, ("raised", "cleared")), (2, ("raised",))):
         for seq, kind in enumerate(kinds):
-            told = [asdict(signal) for signal in signals[::-1][number - 1 :]] if kind == "raised" else []
-            store.alarms.append(machine, None if seq == 0 else number, seq, AlarmKind(kind), head | {"signals": told})
-    store.alarms.append(machine, 2, 1, AlarmKind.PROPOSED, {"proposal": proposal, "text": f"proposal {proposal} waits{evil}"})
+            told = tuple(signals[::-1][number - 1 :]) if kind == "raised" else ()
+            store.alarms.append(machine, None if seq == 0 else number, seq, AlarmKind(kind), replace(head, signals=told))
+    store.alarms.append(machine, 2, 1, AlarmKind.PROPOSED, AlarmFacts(proposal=proposal, text=f"proposal {proposal} waits{evil}"))
 
 
 def _slots(store: Store, machine: str, schedules: list[Schedule], evil: str) -> None:

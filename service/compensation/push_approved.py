@@ -63,8 +63,8 @@ def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord
 
     Older approved proposals are not tried in its place: the last approval supersedes them.
     """
-    tried = {e.doc.get("approval") for e in entries if e.kind == AlarmKind.PUSHING}
-    asked = {e.doc.get("proposal"): e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
+    tried = {e.facts.approval for e in entries if e.kind == AlarmKind.PUSHING}
+    asked = {e.facts.proposal: e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
     given = [(rows[-1].id, record.id) for record in store.proposals.all(machine) if (rows := store.proposals.approvals(record.id))]
     if not given:
         return None

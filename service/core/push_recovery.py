@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable, Callable, MutableSequence
+from dataclasses import asdict
 
 import structlog
 
@@ -109,12 +110,13 @@ class PushRecovery:
 
     async def _report(self, trouble: Exception) -> None:
         cause = record.cause_of(trouble)
-        text = f"{cause['code']}: {cause['what']}" + (f" - {cause['remedy']}" if cause["remedy"] else "")
+        text = f"{cause.code}: {cause.what}" + (f" - {cause.remedy}" if cause.remedy else "")
         if text == self._reported:
             return
         self._show(text)
-        log.error("recovery failed: what was left open cannot be closed", **cause)
-        await self._alarms.alarm({**cause, "at_utc": self._clock.utc().isoformat()})
+        known = asdict(cause)
+        log.error("recovery failed: what was left open cannot be closed", **known)
+        await self._alarms.alarm({**known, "at_utc": self._clock.utc().isoformat()})
 
     def _show(self, text: str | None) -> None:
         if self._reported is not None:

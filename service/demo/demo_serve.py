@@ -236,17 +236,17 @@ async def narrate(simulator: SimulatorProcess, machine: str, store: Store, servi
     alarm = (await _until(lambda: alarms_of(store, machine)))[-1]
     show(f"4. alarm {alarm.number}: {alarm.text}")
     found = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.DISCOVERED, AlarmKind.ENDED, AlarmKind.FAILED))
-    show(f"5. the service has measured the full campaign and searched: {found.doc['text']}")
+    show(f"5. the service has measured the full campaign and searched: {found.facts.text}")
     proposed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PROPOSED, AlarmKind.ENDED, AlarmKind.FAILED))
-    proposal = int(proposed.doc.get("proposal", 0))
-    show(f"   {proposed.doc['text']}")
+    proposal = proposed.facts.proposal or 0
+    show(f"   {proposed.facts.text}")
     if proposed.kind is not AlarmKind.PROPOSED:
         raise AbbeError("the service proposes nothing", f"see {serving.log}; try another --seed")
     show(f"   approve it at {serving.page}proposal?id={proposal}")
     who = (await _until(lambda: store.proposals.approvals(proposal)))[-1].name
     show(f"6. approved by {who}: the service pushes it now, proves its sign and verifies it")
     pushed = await _until(lambda: alarms_of(store, machine)[-1].last(AlarmKind.PUSHED))
-    show(f"7. {pushed.doc['text']}")
+    show(f"7. {pushed.facts.text}")
     await _until(lambda: not alarms_of(store, machine)[-1].active)
     checks = await _until(lambda: _checks(store, machine))
     show(f"8. the check after it: {checks[-1]}; the alarm is over")

@@ -33,7 +33,7 @@ class DocumentRow(Row):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class HistoryRow:
+class HistoryLine:
     """One line of a history that only grows: never changed after writing; ``seq`` counts from 0.
 
     ``id``: 0 before it is stored.
@@ -41,8 +41,14 @@ class HistoryRow:
 
     id: int = 0
     seq: int
-    doc: Doc
     utc: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HistoryRow(HistoryLine):
+    """A line of a history that holds a document."""
+
+    doc: Doc
 
 
 _adapters: dict[type[Any], TypeAdapter[Any]] = {}
@@ -54,9 +60,9 @@ def _adapter(kind: type[Any]) -> TypeAdapter[Any]:
     return _adapters[kind]
 
 
-def document(record: Any) -> Doc:
-    """Turn a record (a dataclass) into a JSON object."""
-    doc: Doc = _adapter(type(record)).dump_python(record, mode="json", by_alias=True)
+def document(record: Any, *, stated_only: bool = False) -> Doc:
+    """Turn a record (a dataclass) into a JSON object; ``stated_only``: without fields that have their default."""
+    doc: Doc = _adapter(type(record)).dump_python(record, mode="json", by_alias=True, exclude_defaults=stated_only)
     return doc
 
 

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from datetime import datetime
 from enum import StrEnum
 
-from abbe.service.domain.document import Doc, HistoryRow, Row
+from abbe.service.domain.document import Doc, HistoryLine, Row
 from abbe.service.domain.measured import Owner
+from abbe.service.domain.verification import CheckFailure
 
 
 class AlarmKind(StrEnum):
@@ -27,13 +29,65 @@ class AlarmKind(StrEnum):
     PUSHED = "pushed"
 
 
+@dataclass(frozen=True, slots=True)
+class Signal:
+    """One reason why a check raises an alarm: the judged figure with its numbers.
+
+    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days`` (few days until the limit). ``baseline``,
+    ``baseline_u``: reference value of ``jump`` and its standard uncertainty.
+    """
+
+    figure: str
+    kind: str
+    value: float
+    expanded: float
+    limit: float
+    text: str
+    baseline: float | None = None
+    baseline_u: float | None = None
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmEntryRecord(HistoryRow):
+class AlarmFacts:
+    """What an entry of an alarm states. A fact that its kind does not have keeps its default; ``text``: a sentence for people.
+
+    Of a check: ``recipe``, ``schedule``, its number ``verification``, and its ``signals``. Of a person: ``name``, ``comment`` or
+    ``reason``, and the end of a shelving, ``until_utc``. Of an investigation: its ``campaign``, its ``discovery``, what speaks ``against``
+    tables (empty: nothing), the unexplained readings beyond noise ``rms_um``, ``unnamed`` (something is missing, and no effect was found
+    for it), its ``proposal``, the ``code`` of a refusal, the ``cause`` of a failure. Of a push: ``proposal``, ``approval``, the number of
+    the push before it, ``after``, and its outcome ``word`` as in `JobOutcome`.
+    """
+
+    text: str = ""
+    recipe: str = ""
+    schedule: str = ""
+    verification: int | None = None
+    signals: tuple[Signal, ...] = ()
+    name: str = ""
+    comment: str = ""
+    reason: str = ""
+    until_utc: datetime | None = None
+    campaign: str = ""
+    discovery: int | None = None
+    against: str = ""
+    rms_um: float = 0.0
+    unnamed: bool = False
+    proposal: int | None = None
+    code: str = ""
+    cause: CheckFailure | None = None
+    approval: int | None = None
+    after: int = 0
+    word: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmEntryRecord(HistoryLine):
     """One event of a machine's alarm. ``alarm`` counts from 1 for each machine."""
 
     machine: str
     alarm: int
     kind: AlarmKind
+    facts: AlarmFacts
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,10 +30,9 @@ from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import size_text, verdict_of
 from abbe.service.discovery.linear_change import drift_text
-from abbe.service.domain.document import Doc
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
-from abbe.service.domain.service_records import AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES, current
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
@@ -50,7 +49,7 @@ BESIDE = 0.5
 REFUSALS = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
 """Errors that are answers, not faults: they become the alarm's text, and another try would give the same."""
 
-Note = Callable[[AlarmKind, Doc], Awaitable[Alarm]]
+Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
 """Writes a line of the alarm; returns the alarm including it."""
 
 
@@ -86,23 +85,23 @@ async def investigate(context: InvestigationContext, alarm: Alarm, note: Note) -
             await context.control.gate()
             alarm = await _STEPS[step](context, alarm, note)
     except REFUSALS as no:
-        await note(AlarmKind.ENDED, {"text": f"no proposal: {no}", "code": no.code})
+        await note(AlarmKind.ENDED, AlarmFacts(text=f"no proposal: {no}", code=no.code))
 
 
 async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     tries = sum(s.kind is AlarmKind.BEGUN for s in alarm.work) + 1
     if tries > TRIES:
-        return await note(AlarmKind.ENDED, {"text": f"no proposal: {TRIES} tries to measure the full campaign were not completed"})
+        return await note(AlarmKind.ENDED, AlarmFacts(text=f"no proposal: {TRIES} tries to measure the full campaign were not completed"))
     again = "" if tries == 1 else " again: the last try was not completed"
     plan = replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
     site, options = context.site, MeasureOptions(control=context.control, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(context.store, site) as session:
             # Only now: while another process has the machine, this try has not begun.
-            await note(AlarmKind.BEGUN, {"text": f"measuring campaign {plan.name!r}{again}", "campaign": plan.name})
+            await note(AlarmKind.BEGUN, AlarmFacts(text=f"measuring campaign {plan.name!r}{again}", campaign=plan.name))
             plan = paced(plan, site.max_feed_mm_min)
             ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, options=options)
-    return await note(AlarmKind.MEASURED, {"text": f"campaign {plan.name!r} is measured: {len(ids)} runs", "campaign": plan.name})
+    return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {plan.name!r} is measured: {len(ids)} runs", campaign=plan.name))
 
 
 async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
@@ -121,8 +120,9 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
     _, word, text = verdict_of(finding)
     names = ", ".join(f"{e.full_title} {size_text(e)}" for e in finding.effects)
     changes = changed_text(finding.changed)
-    doc = {"text": "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t), "discovery": number}
-    return await note(AlarmKind.DISCOVERED, doc | _objections(finding, context.store, context.site.name))
+    said = "; ".join(t for t in (f"{word}: {names}" if names else f"{word}: {text}", changes) if t)
+    objections = _objections(finding, context.store, context.site.name)
+    return await note(AlarmKind.DISCOVERED, replace(objections, text=said, discovery=number))
 
 
 def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, Finding]:
@@ -134,7 +134,7 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
     return journal.id, discover(job, journal, search, context.progress)
 
 
-def _objections(finding: Finding, store: Store, machine: str) -> Doc:
+def _objections(finding: Finding, store: Store, machine: str) -> AlarmFacts:
     """Return what speaks against tables: ``against`` (text; empty: nothing), ``rms_um`` (unexplained readings beyond noise), ``unnamed``.
 
     An effect that no table corrects is an objection unless the machine's model contains it: effects of the model are subtracted from the
@@ -149,24 +149,26 @@ def _objections(finding: Finding, store: Store, machine: str) -> Doc:
     if finding.verdict == "unknown":
         why.append("the model lacks something that the catalogue does not know, and a table would hide it")
     unnamed = finding.verdict == "unknown" and not finding.effects
-    return {"against": "; ".join(why), "rms_um": rms_um, "unnamed": unnamed}
+    return AlarmFacts(against="; ".join(why), rms_um=rms_um, unnamed=unnamed)
 
 
 async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
     known = alarm.last(AlarmKind.DISCOVERED)
     assert known is not None
-    if known.doc["unnamed"]:
-        return await note(AlarmKind.ENDED, {"text": f"no proposal: {known.doc['against']} ({known.doc['text']})"})
+    facts = known.facts
+    if facts.unnamed:
+        return await note(AlarmKind.ENDED, AlarmFacts(text=f"no proposal: {facts.against} ({facts.text})"))
 
     def agree(promised: Predicted) -> None:
         check_promise(promised, context.site.limits)
-        check_cause(promised, known.doc["against"], float(known.doc["rms_um"]))
+        check_cause(promised, facts.against, facts.rms_um)
 
     made = await make_proposal(context, _campaign(alarm), agree)
-    doc = {"proposal": made.number, "text": await asyncio.to_thread(promise_text, context.store, made)}
     if made.proposed.reasons:
-        return await note(AlarmKind.ENDED, doc | {"text": f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"})
-    return await note(AlarmKind.PROPOSED, doc | {"beside": known.doc["against"]})
+        text = f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"
+        return await note(AlarmKind.ENDED, AlarmFacts(proposal=made.number, text=text))
+    text = await asyncio.to_thread(promise_text, context.store, made)
+    return await note(AlarmKind.PROPOSED, AlarmFacts(proposal=made.number, text=text, against=facts.against))
 
 
 async def make_proposal(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
@@ -210,7 +212,7 @@ def _campaign(alarm: Alarm) -> str:
     measured = alarm.last(AlarmKind.MEASURED)
     if measured is None:
         raise AbbeError(f"alarm {alarm.number} has no measured campaign")
-    return str(measured.doc["campaign"])
+    return measured.facts.campaign
 
 
 _STEPS: dict[AlarmKind, Callable[[InvestigationContext, Alarm, Note], Awaitable[Alarm]]] = {

@@ -29,21 +29,19 @@ def alarm_lines(store: Store, machine: str, number: int) -> list[AlarmLine]:
 
 
 def _line(one: AlarmEntryRecord) -> AlarmLine:
-    doc = one.doc
-    text = next((str(doc[key]) for key in ("text", "comment", "reason") if doc.get(key)), "")
-    until = doc.get("until_utc")
+    facts = one.facts
     return AlarmLine(
         kind=one.kind,
         utc=datetime.fromisoformat(one.utc),
-        who=str(doc.get("name", "")),
-        text=text,
-        verification=doc.get("verification"),
-        until_utc=None if until is None else datetime.fromisoformat(until),
+        who=facts.name,
+        text=facts.text or facts.comment or facts.reason,
+        verification=facts.verification,
+        until_utc=facts.until_utc,
     )
 
 
 def alarms_of_check(store: Store, machine: str, verification: int) -> list[AlarmSummary]:
     """The alarms that a check raised, held or cleared."""
     entries = store.alarms.entries(machine)
-    numbers = {one.alarm for one in entries if one.doc.get("verification") == verification}
+    numbers = {one.alarm for one in entries if one.facts.verification == verification}
     return [one for one in summaries(folded(entries), every=True) if one.alarm in numbers]

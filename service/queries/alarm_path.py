@@ -4,16 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Literal
+from datetime import datetime
+from typing import Literal, TypeVar
 
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import JournalChanged
-from abbe.service.queries.reader import Reader
+from abbe.service.queries.reader import Reader, StoredResult
 from abbe.service.queries.results import DiscoverySummary, checks, discoveries
 from abbe.service.queries.tables import ProposalSummary, proposals, tables
 from abbe.service.tables.push_journal import PushSummary
 from abbe.service.verification.alarm_states import Alarm, folded
 
+Result = TypeVar("Result", bound=StoredResult)
 Step = Literal["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
 StepState = Literal["done", "now", "waiting", "failed", "skipped"]
 SEARCHED = ("EXPLAINED", "PROPOSED", "FITTED", "UNEXPLAINED")
@@ -111,23 +113,21 @@ class _AlarmHistory:
     def _raising(self, alarm: Alarm) -> int:
         """The latest check that raised or held the alarm."""
         kinds = (AlarmKind.RAISED, AlarmKind.CONTINUED)
-        held = [e.doc["verification"] for e in self._entries if e.kind in kinds]
-        return int(held[-1]) if held else alarm.verification
+        held = [e.facts.verification for e in self._entries if e.kind in kinds]
+        return (held[-1] if held else None) or alarm.verification
 
     def _cleared(self) -> int | None:
-        return next((int(e.doc["verification"]) for e in self._entries if e.kind is AlarmKind.CLEARED), None)
+        return next((e.facts.verification for e in self._entries if e.kind is AlarmKind.CLEARED), None)
 
     def _search(self, alarm: Alarm) -> DiscoverySummary | None:
         told = alarm.last(AlarmKind.DISCOVERED)
-        known = None if told is None else told.doc.get("discovery")
         found = discoveries(self._reader, None, self._reader.machine, None, LATEST)[0]
-        return next((one for one in found if one.number == known or (known is None and one.created_utc > alarm.raised_utc)), None)
+        return _of_alarm(found, alarm, None if told is None else told.facts.discovery)
 
     def _proposal(self, alarm: Alarm) -> ProposalSummary | None:
         told = alarm.last(AlarmKind.PROPOSED)
-        known = None if told is None else told.doc.get("proposal")
         found = proposals(self._reader, self._reader.machine, None, LATEST)[0]
-        return next((one for one in found if one.number == known or (known is None and one.created_utc > alarm.raised_utc)), None)
+        return _of_alarm(found, alarm, None if told is None else told.facts.proposal)
 
     def _push(self, proposal: ProposalSummary | None) -> PushSummary | None:
         if proposal is None:
@@ -146,3 +146,10 @@ class _AlarmHistory:
             if one.recipe == alarm.recipe and not one.push and one.started_utc.isoformat() > push.ended
         ]
         return min(later, default=None)
+
+
+def _of_alarm(found: Sequence[Result], alarm: Alarm, known: int | None) -> Result | None:
+    """The result with the number that the alarm states; if it states none, the newest that came after the alarm."""
+    if known is not None:
+        return next((one for one in found if one.number == known), None)
+    return next((one for one in found if datetime.fromisoformat(one.created_utc) > alarm.raised_utc), None)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from datetime import datetime
 from typing import Literal, Protocol
 
@@ -16,7 +16,7 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.results import latest_checks
 from abbe.service.queries.timetable import NextDue, next_due
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import Alarm, Signal, folded, is_open
+from abbe.service.verification.alarm_states import Alarm, AlarmHead, folded, is_open
 from abbe.service.verification.verified_by import VerifiedBy, strange_table, verified_by
 
 LATEST = 10
@@ -43,28 +43,15 @@ class AlarmWork:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class AlarmSummary:
-    """An alarm for people.
+class AlarmSummary(AlarmHead):
+    """An alarm for people: if it is over, ``signals`` are those that raised it.
 
-    ``signals``: figures of the last check that raised or held it; if it is over, of the one that raised it. ``priority``: as of `Alarm`;
-    ``comment``: of the person who acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past; ``outcome``: latest result of
-    the work on it.
+    ``priority``: as of `Alarm`; ``outcome``: latest result of the work on it.
     """
 
     alarm: int
     state: Literal["raised", "acknowledged", "cleared", "closed"]
-    recipe: str
-    schedule: str
-    text: str
-    signals: Sequence[Signal]
-    verification: int
     priority: int
-    raised_utc: datetime
-    acknowledged_by: str = ""
-    acknowledged_utc: datetime | None = None
-    comment: str = ""
-    cleared_utc: datetime | None = None
-    shelved_until_utc: datetime | None = None
     outcome: str = ""
     work: Sequence[AlarmWork] = ()
     proposal: int | None = None
@@ -224,26 +211,13 @@ def summaries(found: Sequence[Alarm], *, every: bool = False) -> list[AlarmSumma
 
 def _alarm(one: Alarm) -> AlarmSummary:
     proposed = one.last(AlarmKind.PROPOSED)
+    head = {item.name: getattr(one, item.name) for item in fields(AlarmHead)}
     return AlarmSummary(
+        **head | {"signals": one.signals or one.first},
         alarm=one.number,
         state=one.word,
-        recipe=one.recipe,
-        schedule=one.schedule,
-        text=one.text,
-        signals=one.signals or one.first,
-        verification=one.verification,
         priority=one.priority,
-        raised_utc=datetime.fromisoformat(one.raised_utc),
-        acknowledged_by=one.acknowledged_by,
-        acknowledged_utc=_time(one.acknowledged_utc),
-        comment=one.comment,
-        cleared_utc=_time(one.cleared_utc),
-        shelved_until_utc=_time(one.shelved_until_utc),
         outcome=one.outcome,
-        work=[AlarmWork(kind=s.kind, utc=datetime.fromisoformat(s.utc), text=str(s.doc.get("text", ""))) for s in one.work],
-        proposal=None if proposed is None else proposed.doc.get("proposal"),
+        work=[AlarmWork(kind=s.kind, utc=datetime.fromisoformat(s.utc), text=s.facts.text) for s in one.work],
+        proposal=None if proposed is None else proposed.facts.proposal,
     )
-
-
-def _time(utc: str) -> datetime | None:
-    return datetime.fromisoformat(utc) if utc else None

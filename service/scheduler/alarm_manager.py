@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from abc import abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from functools import partial
 
 import structlog
@@ -17,7 +17,7 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Needs, Schedule
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler import record
@@ -28,7 +28,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, next_step
-from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_line, evaluate_alarm, last_seq
+from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_facts, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")
 
@@ -107,7 +107,7 @@ class AlarmManager(RetryingStore):
         looked = await self._read(evaluate_alarm, self._store, self._machine, recipe, records, warn_days)
         if looked.kind is None:
             return ""
-        line = check_line(looked, recipe, doc["schedule"], number)
+        line = check_facts(looked, recipe, doc["schedule"], number)
         entry = await self.line(None if looked.now is None else looked.now.number, looked.kind, line)
         return f"alarm {entry.alarm} {looked.kind}: {looked.found.text}"
 
@@ -130,9 +130,9 @@ class AlarmManager(RetryingStore):
         last = {e.alarm: e for e in entries if e.kind in (AlarmKind.PUSHING, AlarmKind.PUSHED)}
         changed = False
         for entry in last.values():
-            if entry.kind == AlarmKind.PUSHED and entry.doc.get("word") != OPEN:
+            if entry.kind == AlarmKind.PUSHED and entry.facts.word != OPEN:
                 continue
-            proposal, after = int(entry.doc["proposal"]), int(entry.doc.get("after", 0))
+            proposal, after = entry.facts.proposal or 0, entry.facts.after
             now = await asyncio.to_thread(self._of_proposal, proposal, after) or NOTHING_YET
             if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
                 text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
@@ -140,9 +140,9 @@ class AlarmManager(RetryingStore):
                 changed = True
         return await asyncio.to_thread(self._store.alarms.entries, self._machine) if changed else entries
 
-    async def note(self, number: int, kind: AlarmKind, doc: Doc) -> Alarm:
+    async def note(self, number: int, kind: AlarmKind, facts: AlarmFacts) -> Alarm:
         """Write an entry of an alarm; return the alarm including it."""
-        await self.line(number, kind, doc)
+        await self.line(number, kind, facts)
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
     async def settled(self, found: ApprovedProposal, after: int, reported: JobOutcome) -> JobOutcome:
@@ -168,14 +168,14 @@ class AlarmManager(RetryingStore):
 
     async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:
         text = f"proposal {proposal} {OUTCOME_TEXTS.get(done.word, done.word)}: {done.text}"
-        await self.line(alarm, AlarmKind.PUSHED, {"proposal": proposal, "after": after, "word": done.word, "text": text})
+        await self.line(alarm, AlarmKind.PUSHED, AlarmFacts(proposal=proposal, after=after, word=done.word, text=text))
 
     def _check_again(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         """Return the check to repeat once after a kept push: the one that raised the alarm. Its trend starts anew with this check."""
         for one in alarms:
             pushed = one.last(AlarmKind.PUSHED)
             schedule = self._schedule_of(one)
-            if pushed is None or pushed.doc.get("word") != "kept" or one.judged_seq > pushed.seq or schedule is None:
+            if pushed is None or pushed.facts.word != "kept" or one.judged_seq > pushed.seq or schedule is None:
                 continue
             if (one.number, pushed.seq) not in self._checked_again:
                 # Marked only when it begins: a check that may not start yet is offered again.
@@ -214,25 +214,27 @@ class AlarmManager(RetryingStore):
         same = [s for s in self._schedules if s.recipe == one.recipe]
         return next((s for s in same if s.name == one.schedule), next(iter(same), None))
 
-    async def line(self, number: int | None, kind: AlarmKind, doc: Doc) -> AlarmEntryRecord:
+    async def line(self, number: int | None, kind: AlarmKind, facts: AlarmFacts) -> AlarmEntryRecord:
         """Write an entry with its message and its record in the audit."""
         messages = []
         if self._channels.topic is not None and kind in CODES:
             head = {"schema": record.SCHEMA, "machine": self._machine, "code": CODES[kind], "at_utc": self._clock.utc().isoformat()}
-            messages.append((self._channels.topic, head | {"kind": str(kind), "what": doc["text"], "signals": doc.get("signals", [])}))
+            messages.append(
+                (self._channels.topic, head | {"kind": str(kind), "what": facts.text, "signals": [asdict(one) for one in facts.signals]})
+            )
 
         def append() -> AlarmEntryRecord:
             seq = 0 if number is None else last_seq(self._store.alarms.entries(self._machine), number) + 1
-            return self._store.alarms.append(self._machine, number, seq, kind, doc, messages)
+            return self._store.alarms.append(self._machine, number, seq, kind, facts, messages)
 
         entry = await self._write(append)
         if messages:
             self._channels.posted()
-        log.warning(doc["text"], alarm=entry.alarm, kind=str(kind))
+        log.warning(facts.text, alarm=entry.alarm, kind=str(kind))
         if kind is not AlarmKind.CONTINUED:
             target = f"{self._machine}, alarm {entry.alarm}" if entry.alarm != NO_ALARM else self._machine
             try:
-                event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": doc["text"]})
+                event = AuditEvent(who=this_account(), action="abbe serve", target=target, outcome=str(kind), doc={"text": facts.text})
                 await asyncio.to_thread(self._channels.audit.write, event)
             except AbbeError as error:  # the entry itself is stored: a service that ended here would raise no more alarms
                 log.error("the audit record of an alarm was not written", cause=error.detail)
@@ -276,16 +278,16 @@ class _Investigation(_AlarmJob):
     async def failed(self, error: Exception) -> JobOutcome:
         cause = record.cause_of(error)
         how = "was ended by a person" if isinstance(error, Stopped | Aborted) else "failed"
-        await self._note(AlarmKind.FAILED, {"text": f"the investigation {how}: {cause['what']}", "cause": cause})
+        await self._note(AlarmKind.FAILED, AlarmFacts(text=f"the investigation {how}: {cause.what}", cause=cause))
         return self._last
 
     async def defect(self, error: Exception) -> None:
         """Record the defect, so that the next service does not fail at the same alarm again."""
         await self.failed(error)
 
-    async def _note(self, kind: AlarmKind, doc: Doc) -> Alarm:
-        self._last = JobOutcome(str(kind), doc["text"])
-        return await self._manager.note(self._alarm.number, kind, doc)
+    async def _note(self, kind: AlarmKind, facts: AlarmFacts) -> Alarm:
+        self._last = JobOutcome(str(kind), facts.text)
+        return await self._manager.note(self._alarm.number, kind, facts)
 
 
 class _ApprovedPush(_AlarmJob):
@@ -308,8 +310,9 @@ class _ApprovedPush(_AlarmJob):
     async def _begun(self) -> None:
         if not self._is_begun:
             text = f"proposal {self._found.proposal} is being pushed"
-            doc = {"proposal": self._found.proposal, "approval": self._found.approval, "after": self._after, "text": text}
-            await self._manager.line(self._found.alarm, AlarmKind.PUSHING, doc)
+            found = self._found
+            facts = AlarmFacts(proposal=found.proposal, approval=found.approval, after=self._after, text=text)
+            await self._manager.line(found.alarm, AlarmKind.PUSHING, facts)
             self._is_begun = True
 
     async def failed(self, error: Exception) -> JobOutcome:

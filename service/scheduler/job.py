@@ -8,7 +8,7 @@ from __future__ import annotations
 import asyncio
 from abc import ABC, abstractmethod
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from typing import Any, ClassVar, Generic, Protocol, TypeVar
 
@@ -169,7 +169,7 @@ def is_defect(error: Exception) -> bool:
 def failure(error: Exception) -> JobOutcome:
     """Return the outcome of work that failed or that a person ended: cause, remedy, and the notes of the error."""
     ended, cause = isinstance(error, Stopped | Aborted), record.cause_of(error)
-    parts = [cause["what"], "" if ended else cause["remedy"], *getattr(error, "__notes__", [])]
+    parts = [cause.what, "" if ended else cause.remedy, *getattr(error, "__notes__", [])]
     return JobOutcome("stopped" if ended else "failed", "; ".join(filter(None, parts)))
 
 
@@ -217,7 +217,7 @@ class _CheckJob(Job[Doc]):
         return record.check_doc(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
 
     async def failed(self, error: Exception) -> Doc:
-        log.warning("check failed", schedule=self.terms.name, **record.cause_of(error), exc_info=_traceback(error))
+        log.warning("check failed", schedule=self.terms.name, **asdict(record.cause_of(error)), exc_info=_traceback(error))
         return record.failed_doc(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
 
     async def end(self, outcome: Doc) -> SlotState:

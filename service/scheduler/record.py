@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 
 from abbe.drivers.errors import DriverError
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.verification import CheckResult
+from abbe.service.domain.verification import CheckFailure, CheckResult
 from abbe.service.errors import AbbeError
 from abbe.service.scheduler.ports import Doc
 
@@ -58,35 +58,29 @@ def failed_doc(occasion: Occasion, cause: Exception, started_utc: datetime, dura
         "limits": {},
         "campaign": "",
         "runs": [],
-        "text": f"The check could not be completed: {reason['what']}",
-        "cause": reason,
+        "text": f"The check could not be completed: {reason.what}",
+        "cause": asdict(reason),
     }
 
 
 def alarm(doc: Doc) -> Doc:
     """Return the alarm that goes with the document of a failed check."""
-    cause = doc["cause"]
-    return {
-        "code": cause["code"],
-        "what": cause["what"],
-        "remedy": cause["remedy"],
-        "device": cause["device"],
-        "at_utc": doc["started_utc"],
-    }
+    return {**doc["cause"], "at_utc": doc["started_utc"]}
 
 
-def cause_of(cause: Exception) -> Doc:
+def cause_of(cause: Exception) -> CheckFailure:
     """Return code, one line of cause, remedy and device of an error.
 
     Of a group of errors, the first one of a driver or of Abbe counts: if several devices fail together, the first failure matters.
     """
     known = _first(cause)
     if isinstance(known, DriverError):
-        return {"code": known.code, "what": _line(f"{known.operation}: {known.detail}"), "remedy": known.remedy, "device": known.device}
+        what = _line(f"{known.operation}: {known.detail}")
+        return CheckFailure(code=known.code, what=what, remedy=known.remedy, device=known.device)
     if isinstance(known, AbbeError):
-        return {"code": known.code, "what": _line(known.detail), "remedy": known.remedy, "device": ""}
+        return CheckFailure(code=known.code, what=_line(known.detail), remedy=known.remedy)
     name = type(known).__name__
-    return {"code": "ABB-001", "what": _line(f"{name}: {known}"), "remedy": "see the service's log for details", "device": ""}
+    return CheckFailure(code="ABB-001", what=_line(f"{name}: {known}"), remedy="see the service's log for details")
 
 
 def _first(cause: Exception) -> Exception:

@@ -25,6 +25,8 @@ from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 from abbe.service.clock import utc_text
 from abbe.service.domain import decisions, measured, people, push_entry, results, service_records
 from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.document import document
+from abbe.service.domain.document import record as parse_record
 from abbe.service.domain.measured import Owner
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.secrets import mask_secrets
@@ -157,7 +159,7 @@ class RecordMapping(Generic[R]):
     SQLAlchemy's own mapper writes its state into the object and refuses frozen ones (decision 0037).
 
     ``source``: the FROM clause to read, if it is more than the table. ``**other``: expression or nested mapping of each field that is not
-    the column of the same name.
+    the column of the same name. A JSON column whose field is a dataclass is parsed into it, and written without its defaults.
     """
 
     def __init__(
@@ -173,6 +175,10 @@ class RecordMapping(Generic[R]):
         self._fields = {name: other[name] if name in other else table.c[name] for name in names}
         kinds = get_type_hints(record)
         self._enums = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, StrEnum)}
+        nested = {name for name, column in self._fields.items() if isinstance(column, RecordMapping)}
+        self._documents = {
+            name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind) and name not in nested
+        }
 
     @property
     def columns(self) -> list[ColumnElement[Any]]:
@@ -198,6 +204,8 @@ class RecordMapping(Generic[R]):
         }
         for name, kind in self._enums.items():
             found[name] = kind(found[name])
+        for name, document_kind in self._documents.items():
+            found[name] = parse_record(document_kind, found[name], f"a row of {self.table.name}")
         return self._make(**found)
 
     def values(self, record: R, *without: str) -> dict[str, Any]:
@@ -208,6 +216,8 @@ class RecordMapping(Generic[R]):
                 found |= column.values(getattr(record, name))
             elif isinstance(column, Column) and column.table is self.table and name not in without:
                 value = getattr(record, name)
+                if name in self._documents:
+                    value = document(value, stated_only=True)
                 found[column.name] = value.value if name in self._enums else value
         return found
 
@@ -243,7 +253,7 @@ PUSH_ENTRY = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_e
 PUSH_MARK = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id, doc=null())
 """A push entry without its document, which holds the images of tables."""
 
-ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries)
+ALARM_ENTRY = RecordMapping(service_records.AlarmEntryRecord, t.alarm_entries, facts=t.alarm_entries.c.doc)
 SLOT = RecordMapping(service_records.SlotRecord, t.slots, reason=func.coalesce(t.slots.c.reason, ""))
 HEARTBEAT = RecordMapping(service_records.HeartbeatRecord, t.heartbeats, owner=owner_of(t.heartbeats))
 OUTBOX = RecordMapping(service_records.OutboxRecord, t.outbox)

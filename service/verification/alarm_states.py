@@ -9,11 +9,11 @@ time, in which it does not ask for attention (ISA-18.2, IEC 62682).
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from datetime import datetime
 from typing import Literal
 
-from abbe.service.domain.document import Doc, record
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, Signal
 
 OF_WORK = (
     AlarmKind.BEGUN,
@@ -34,24 +34,6 @@ NO_ALARM = 0
 
 
 @dataclass(frozen=True, slots=True)
-class Signal:
-    """One reason why a check raises an alarm: the judged figure with its numbers.
-
-    ``kind``: ``limit`` (above its limit by more than U), ``jump``, ``drift``, ``days`` (few days until the limit). ``baseline``,
-    ``baseline_u``: reference value of ``jump`` and its standard uncertainty.
-    """
-
-    figure: str
-    kind: str
-    value: float
-    expanded: float
-    limit: float
-    text: str
-    baseline: float | None = None
-    baseline_u: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class FiredRule:
     """Signals of a check. ``judged``: whether its figures can be judged (measured, and within the allowed temperature)."""
 
@@ -65,32 +47,37 @@ class FiredRule:
         return "; ".join(s.text for s in self.signals) or f"no signal, verdict {self.verdict}"
 
 
-@dataclass(frozen=True, slots=True)
-class Alarm:
-    """An alarm after all its lines.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmHead:
+    """What everybody is told of an alarm.
 
-    ``signals``: of the last check that raised or held it; ``first``: of the check that raised it; ``comment``: of the person who
-    acknowledged it; ``shelved_until_utc``: empty if nobody shelved it.
+    ``signals``: of the last check that raised or held it; ``verification``: number of that check; ``comment``: of the person who
+    acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past.
     """
 
-    number: int
     recipe: str
     schedule: str
-    raised_utc: str
-    first: tuple[Signal, ...]
-    signals: tuple[Signal, ...]
     text: str
+    signals: tuple[Signal, ...]
     verification: int
+    raised_utc: datetime
+    acknowledged_by: str = ""
+    acknowledged_utc: datetime | None = None
+    comment: str = ""
+    cleared_utc: datetime | None = None
+    shelved_until_utc: datetime | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Alarm(AlarmHead):
+    """An alarm after all its lines. ``first``: signals of the check that raised it; ``judged_seq``: line of the last check."""
+
+    number: int
+    first: tuple[Signal, ...]
     last_seq: int
-    changed_utc: str
     active: bool = True
     judged_seq: int = 0
-    acknowledged_by: str = ""
-    acknowledged_utc: str = ""
-    comment: str = ""
-    cleared_utc: str = ""
-    shelved_until_utc: str = ""
-    work: tuple[AlarmEntryRecord, ...] = field(default=())
+    work: tuple[AlarmEntryRecord, ...] = ()
 
     @property
     def word(self) -> Literal["raised", "acknowledged", "cleared", "closed"]:
@@ -112,7 +99,7 @@ class Alarm:
     @property
     def outcome(self) -> str:
         """Latest result of the work on the alarm as a sentence; empty without any."""
-        return str(self.work[-1].doc.get("text", "")) if self.work else ""
+        return self.work[-1].facts.text if self.work else ""
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
@@ -137,41 +124,36 @@ def folded(lines: Iterable[AlarmEntryRecord]) -> list[Alarm]:
 
 
 def _raised(line: AlarmEntryRecord) -> Alarm:
-    d = line.doc
-    signals = _signals(d)
+    facts = line.facts
     return Alarm(
-        line.alarm,
-        d["recipe"],
-        d["schedule"],
-        line.utc,
-        signals,
-        signals,
-        d["text"],
-        d["verification"],
-        line.seq,
-        line.utc,
+        number=line.alarm,
+        recipe=facts.recipe,
+        schedule=facts.schedule,
+        raised_utc=datetime.fromisoformat(line.utc),
+        first=facts.signals,
+        signals=facts.signals,
+        text=facts.text,
+        verification=facts.verification or 0,
+        last_seq=line.seq,
         judged_seq=line.seq,
     )
 
 
-def _signals(doc: Doc) -> tuple[Signal, ...]:
-    return tuple(record(Signal, one, "the alarm") for one in doc["signals"])
-
-
 def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
-    d, kind = line.doc, line.kind
-    alarm = replace(alarm, last_seq=line.seq, changed_utc=line.utc)
+    facts, kind = line.facts, line.kind
+    alarm = replace(alarm, last_seq=line.seq)
     if kind is AlarmKind.ACKNOWLEDGED:
-        known = replace(alarm, acknowledged_by=d["name"], acknowledged_utc=line.utc, comment=str(d.get("comment", "")))
-        return alarm if alarm.acknowledged_by else known
+        if alarm.acknowledged_by:
+            return alarm
+        return replace(alarm, acknowledged_by=facts.name, acknowledged_utc=datetime.fromisoformat(line.utc), comment=facts.comment)
     if kind is AlarmKind.SHELVED:
-        return replace(alarm, shelved_until_utc=d["until_utc"])
+        return replace(alarm, shelved_until_utc=facts.until_utc)
     if kind in OF_WORK:
         return replace(alarm, work=(*alarm.work, line))
     if not alarm.active:
         return alarm
-    alarm = replace(alarm, signals=_signals(d), text=d["text"], verification=d["verification"], judged_seq=line.seq)
-    return replace(alarm, active=False, cleared_utc=line.utc) if kind is AlarmKind.CLEARED else alarm
+    alarm = replace(alarm, signals=facts.signals, text=facts.text, verification=facts.verification or 0, judged_seq=line.seq)
+    return replace(alarm, active=False, cleared_utc=datetime.fromisoformat(line.utc)) if kind is AlarmKind.CLEARED else alarm
 
 
 def is_open(alarm: Alarm) -> bool:

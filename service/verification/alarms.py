@@ -3,20 +3,18 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from datetime import datetime, timedelta
 
 import numpy as np
 
 from abbe.models.trend import MIN_CHECKS, MOST_CHECKS, jumps, mean_of
-from abbe.service.clock import utc_text
-from abbe.service.domain.document import Doc
 from abbe.service.domain.results import VerificationRecord
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind, Signal
 from abbe.service.errors import AlarmRefused, NotStored
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
-from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, after_check, folded
+from abbe.service.verification.alarm_states import Alarm, FiredRule, after_check, folded
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
 from abbe.service.verification.verify import judge
 
@@ -111,8 +109,10 @@ def acknowledge(store: Store, machine: str, number: int, name: str, comment: str
     """
     one = alarm_numbered(store, machine, number)
     if one.acknowledged_by:
-        raise AlarmRefused(f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc}")
-    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, {"name": name, "comment": comment})
+        raise AlarmRefused(
+            f"alarm {number} of {machine} was acknowledged by {one.acknowledged_by} at {one.acknowledged_utc:%Y-%m-%d %H:%M:%S} UTC"
+        )
+    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.ACKNOWLEDGED, AlarmFacts(name=name, comment=comment))
     return alarm_numbered(store, machine, number)
 
 
@@ -131,8 +131,8 @@ def shelve(store: Store, machine: str, number: int, name: str, reason: str, hour
         raise AlarmRefused(f"alarm {number} is over and acknowledged", "there is nothing to shelve")
     if not timedelta() <= time <= LONGEST_SHELF or (hours > 0 and not reason.strip()):
         raise AlarmRefused("to shelve an alarm needs a reason and a time", f"at most {LONGEST_SHELF.days} days")
-    doc = {"name": name, "reason": reason.strip(), "until_utc": utc_text(store.utcnow() + time)}
-    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.SHELVED, doc)
+    facts = AlarmFacts(name=name, reason=reason.strip(), until_utc=store.utcnow() + time)
+    store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.SHELVED, facts)
     return alarm_numbered(store, machine, number)
 
 
@@ -162,16 +162,16 @@ def evaluate_alarm(store: Store, machine: str, recipe: str, records: Sequence[Ve
     """Compare the latest check of a recipe with earlier ones and with the active alarm. Nothing is written."""
     begins, now = series_begins(store, machine), active_alarm(store, machine, recipe)
     compare = None
-    if now is not None and (begins is None or begins < datetime.fromisoformat(now.raised_utc)):
+    if now is not None and (begins is None or begins < now.raised_utc):
         compare = {s.figure: (s.baseline, s.baseline_u) for s in now.first if s.baseline is not None and s.baseline_u is not None}
     found = found_in(records, AlarmTerms(recipe, begins, warn_days, compare))
     return AlarmCheck(after_check(now, found), now, found)
 
 
-def check_line(check: AlarmCheck, recipe: str, schedule: str, verification: int) -> Doc:
-    """Document of the alarm line of a check."""
-    signals = [asdict(s) for s in check.found.signals]
-    return {"recipe": recipe, "schedule": schedule, "verification": verification, "signals": signals, "text": check.found.text}
+def check_facts(check: AlarmCheck, recipe: str, schedule: str, verification: int) -> AlarmFacts:
+    """What the alarm line of a check states."""
+    found = check.found
+    return AlarmFacts(recipe=recipe, schedule=schedule, verification=verification, signals=found.signals, text=found.text)
 
 
 def last_seq(entries: Sequence[AlarmEntryRecord], number: int) -> int:

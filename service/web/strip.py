@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.service.domain.progress import RunningCheck
+from abbe.service.domain.service_records import Signal
 from abbe.service.queries.status import AlarmSummary, Status
 from abbe.service.sequences.control import State
-from abbe.service.verification.alarm_states import Signal
 from abbe.service.web import language
 from abbe.service.web.frame import current
 

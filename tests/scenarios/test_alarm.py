@@ -152,9 +152,9 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         found = shop.alarms()[0]
         kinds = [step.kind for step in found.work]
         assert kinds == [AlarmKind.BEGUN, AlarmKind.MEASURED, AlarmKind.DISCOVERED, AlarmKind.PROPOSED], found.outcome
-        proposed = found.work[-1].doc
-        number, change = proposed["proposal"], re.search(r"largest change: ([+-][\d.]+) µm .* in the table of X over X", proposed["text"])
-        assert change is not None, proposed["text"]  # what drifted: X, by its own scale
+        proposed = found.work[-1].facts
+        number, change = proposed.proposal, re.search(r"largest change: ([+-][\d.]+) µm .* in the table of X over X", proposed.text)
+        assert change is not None, proposed.text  # what drifted: X, by its own scale
         assert abs(float(change[1])) == pytest.approx(72.0, abs=15.0)  # 120 µm/m over 600 mm, and what X had before
         assert shop.state(number) == "proposed"
         assert shop.store.pushes.entries("sim") == []  # nothing is written, nobody has approved
@@ -168,7 +168,7 @@ async def test_a_drift_is_found_named_proposed_approved_pushed_and_over(shop: Sh
         await until(lambda: shop.alarms()[0].last(AlarmKind.PUSHED))
         pushed = shop.alarms()[0].last(AlarmKind.PUSHED)
         assert pushed is not None
-        assert pushed.doc["word"] == "kept", pushed.doc["text"]
+        assert pushed.facts.word == "kept", pushed.facts.text
         over = await until(lambda: None if shop.alarms()[0].active else shop.alarms()[0])
         assert over.word == "closed"
         assert shop.state(number) == "kept"

@@ -26,7 +26,7 @@ from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.domain.progress import ignore_progress
-from abbe.service.domain.service_records import AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import StoreError, TableRefused
 from abbe.service.sequences.control import Control, Watching
 from abbe.service.site import Site, site_of
@@ -170,7 +170,7 @@ def test_where_nobody_is_there_more_is_asked_for(shop):
         ended = asyncio.run(push_approved(shop.site, store, order, clock=SystemClock()))
         assert begun == [number]
         assert (ended.word, "a person who approves has to be at the machine" in ended.text) == ("refused", True)
-        tried = store.alarms.append("sim", 0, 0, AlarmKind.PUSHING, {"proposal": number, "approval": row.id})
+        tried = store.alarms.append("sim", 0, 0, AlarmKind.PUSHING, AlarmFacts(proposal=number, approval=row.id))
         assert next_approved(store, "sim", [tried], SystemClock().utc().timestamp()) is None
         assert store.pushes.entries("sim") == []
     assert shop.words() == shop.untouched

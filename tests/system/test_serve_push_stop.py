@@ -45,8 +45,8 @@ def told(folder: Path) -> tuple[str, list[str], list[str]]:
     with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
         entries = store.pushes.entries("sim")
         check_chain(entries)
-        lines = [e.doc for e in store.alarms.entries("sim") if e.kind == "pushed"]
-        return str(entries[-1].state), [d["word"] for d in lines], [d["text"] for d in lines]
+        lines = [e.facts for e in store.alarms.entries("sim") if e.kind == "pushed"]
+        return str(entries[-1].state), [one.word for one in lines], [one.text for one in lines]
 
 
 closed = pytest.param(True, id="the way back is not open", marks=pytest.mark.skipif(not LONG, reason="only with ABBE_TEST_LONG=1"))

@@ -60,7 +60,7 @@ def acknowledge(
     loaded = load_machine(machine_file(machine))
     with open_store(loaded.database_url) as store:
         done = work(store, loaded.machine.name, number, name.strip() or login())
-    text = f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc}"
+    text = f"alarm {number} is {done.word}: seen by {done.acknowledged_by} at {done.acknowledged_utc:%Y-%m-%d %H:%M:%S} UTC"
     answer({"alarm": number, "state": done.word, "acknowledged_by": done.acknowledged_by, "text": text}, text, as_json=as_json)
     conclude("abbe alarm list", machine=machine, as_json=as_json)
 

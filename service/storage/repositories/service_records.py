@@ -18,7 +18,15 @@ from abbe.service.clock import utc_text
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import Owner, this_process
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, HeartbeatRecord, OutboxRecord, ReplyRecord, SlotRecord
+from abbe.service.domain.service_records import (
+    AlarmEntryRecord,
+    AlarmFacts,
+    AlarmKind,
+    HeartbeatRecord,
+    OutboxRecord,
+    ReplyRecord,
+    SlotRecord,
+)
 from abbe.service.errors import StoreError
 from abbe.service.storage.database import (
     ALARM_ENTRY,
@@ -115,7 +123,7 @@ class Alarms(Repository):
     """Alarms of machines."""
 
     def append(
-        self, machine: str, alarm: int | None, seq: int, kind: AlarmKind, doc: Doc, messages: Sequence[tuple[str, Doc]] = ()
+        self, machine: str, alarm: int | None, seq: int, kind: AlarmKind, facts: AlarmFacts, messages: Sequence[tuple[str, Doc]] = ()
     ) -> AlarmEntryRecord:
         """Append an entry to an alarm and queue its messages for the broker in one transaction; return the entry.
 
@@ -137,7 +145,7 @@ class Alarms(Repository):
         def work(connection: Connection) -> AlarmEntryRecord:
             last = select(func.coalesce(func.max(alarm_entries.c.alarm), 0)).where(alarm_entries.c.machine == machine)
             number = alarm if alarm is not None else int(connection.execute(last).scalar_one()) + 1
-            entry = AlarmEntryRecord(machine=machine, alarm=number, seq=seq, kind=kind, doc=doc, utc=self._db.now())
+            entry = AlarmEntryRecord(machine=machine, alarm=number, seq=seq, kind=kind, facts=facts, utc=self._db.now())
             try:
                 entry_id = insert_row(connection, alarm_entries, **ALARM_ENTRY.values(entry, "id"))
             except IntegrityError:

@@ -26,7 +26,7 @@ from abbe.service.domain.job_state import JobOutcome, JobState
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
 from abbe.service.jobs.investigate import Note, investigate
@@ -47,7 +47,7 @@ from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_chec
 
 NOON = utc(2026, 6, 1, 12)
 YEARLY = Schedule("yearly", "0 0 1 1 *", "UTC", "quick-check", on_alarm="propose")
-RAISED = {"recipe": "quick-check", "schedule": "yearly", "verification": 1, "signals": [], "text": "too far off"}
+RAISED = AlarmFacts(recipe="quick-check", schedule="yearly", verification=1, text="too far off")
 URL = "modbus+tcp://127.0.0.1:1"
 BASE = {"table": 0, "crc": 7, "base_crc": 5, "base_bank": 0}
 IN_FORCE = (
@@ -136,8 +136,8 @@ class Bench:
         job = self.desk.push_job(ApprovedProposal(4, 9, NO_ALARM), YEARLY)
         state = await carry_out(job, NOON, control or Control())
         last = self.lines()[-1]
-        assert (last.kind, state) == (AlarmKind.PUSHED, f"done: {last.doc['word']}")
-        return last.doc["word"], last.doc["text"]
+        assert (last.kind, state) == (AlarmKind.PUSHED, f"done: {last.facts.word}")
+        return last.facts.word, last.facts.text
 
 
 @pytest.fixture
@@ -202,7 +202,7 @@ async def test_an_investigation_is_a_job_that_can_be_paused_stopped_and_aborted(
 
     async def deaf(alarm: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
         control.now(State.RUNNING)
-        await note(AlarmKind.BEGUN, {"text": "measuring", "campaign": "c"})
+        await note(AlarmKind.BEGUN, AlarmFacts(text="measuring", campaign="c"))
         try:
             await waits.wait()
         except asyncio.CancelledError as error:
@@ -297,7 +297,7 @@ async def test_a_machine_in_use_is_waited_for_and_no_try_is_counted(running: Ben
 
 
 async def free(alarm: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
-    await note(AlarmKind.ENDED, {"text": "nothing to gain"})
+    await note(AlarmKind.ENDED, AlarmFacts(text="nothing to gain"))
 
 
 # ---- the word for a push ------------------------------------------------------------------------------------------------
@@ -315,7 +315,7 @@ async def test_a_kept_table_is_kept_whatever_failed_afterwards(bench: Bench) -> 
     assert text.startswith("proposal 4 kept: push 1: the new table is kept and in force: ")
     assert text.endswith("; the disk is full")
     begun = bench.lines()[0]
-    assert (begun.kind, begun.doc["approval"], begun.doc["after"]) == (AlarmKind.PUSHING, 9, 0)
+    assert (begun.kind, begun.facts.approval, begun.facts.after) == (AlarmKind.PUSHING, 9, 0)
 
 
 Heard = Exception | JobOutcome
@@ -386,7 +386,7 @@ async def test_a_journal_that_cannot_be_read_leaves_the_line_to_the_next_look(be
             await bench.pushed()
     assert [line.kind for line in bench.lines()] == [AlarmKind.PUSHING]
     await bench.desk.due()
-    assert (bench.lines()[-1].kind, bench.lines()[-1].doc["word"]) == (AlarmKind.PUSHED, "kept")
+    assert (bench.lines()[-1].kind, bench.lines()[-1].facts.word) == (AlarmKind.PUSHED, "kept")
 
 
 def _unreadable(*_: object) -> JobOutcome:
@@ -408,8 +408,8 @@ async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: B
     task.cancel()
     with pytest.raises(asyncio.CancelledError):
         await task
-    assert [line.doc.get("word") for line in bench.lines()] == [None, "open"]
-    assert bench.lines()[-1].doc["text"].endswith("(stopped with the service)")
+    assert [line.facts.word for line in bench.lines()] == ["", "open"]
+    assert bench.lines()[-1].facts.text.endswith("(stopped with the service)")
     for _ in range(2):
         await bench.desk.due()
     assert len(bench.lines()) == 2  # once is enough
@@ -419,8 +419,8 @@ async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: B
     for state in (Push.ROLLBACK, Push.ROLLED_BACK):
         await book.append(await book.entries(), state, {"why": "taken back at the start"})
     await bench.desk.due()
-    assert [line.doc.get("word") for line in bench.lines()] == [None, "open", "rolled back"]
-    assert "the old table is in force again: taken back at the start" in bench.lines()[-1].doc["text"]
+    assert [line.facts.word for line in bench.lines()] == ["", "open", "rolled back"]
+    assert "the old table is in force again: taken back at the start" in bench.lines()[-1].facts.text
     await bench.desk.due()
     assert len(bench.lines()) == 3
 
@@ -476,9 +476,9 @@ async def test_what_is_open_by_the_journal(bench: Bench) -> None:
 
 
 async def test_after_a_kill_the_next_start_says_it_by_the_journal(bench: Bench) -> None:
-    doc = {"proposal": 4, "approval": 9, "text": "proposal 4 is being pushed"}  # as releases before this one wrote it
-    bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, doc, [])
+    facts = AlarmFacts(proposal=4, approval=9, text="proposal 4 is being pushed")
+    bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, facts)
     await bench.journal(*KEPT)
     await bench.desk.due()
-    last = bench.lines()[-1].doc
-    assert (last["word"], last["text"].endswith("(it was interrupted with the service)")) == ("kept", True)
+    last = bench.lines()[-1].facts
+    assert (last.word, last.text.endswith("(it was interrupted with the service)")) == ("kept", True)

@@ -19,7 +19,7 @@ from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.service_records import AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import AlarmRefused, StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS
@@ -121,7 +121,7 @@ class Bench:
             self.asked.append(one)
             if self.trouble is not None:
                 raise self.trouble
-            await note(AlarmKind.ENDED, {"text": "no proposal: the tables promise too little"})
+            await note(AlarmKind.ENDED, AlarmFacts(text="no proposal: the tables promise too little"))
 
         async def push_one(order: Any) -> JobOutcome:
             return JobOutcome("kept", "better")
@@ -223,7 +223,7 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
     bench.store.pushes.append(entry)
     assert series_begins(bench.store, "mill-7") == at
     last = alarms_of(bench.store, "mill-7")[0].last_seq
-    bench.store.alarms.append("mill-7", 1, last + 1, AlarmKind.PUSHED, {"word": "kept", "proposal": 1, "text": "proposal 1 kept"})
+    bench.store.alarms.append("mill-7", 1, last + 1, AlarmKind.PUSHED, AlarmFacts(word="kept", proposal=1, text="proposal 1 kept"))
     follow_up = await bench.desk.due()
     assert follow_up is not None
     assert (follow_up.name, follow_up.schedule.recipe, follow_up.job) == ("daily (after push)", "quick-check", None)
@@ -238,25 +238,25 @@ async def test_after_a_kept_push_the_check_is_made_again_and_the_series_begins_a
 
 async def test_a_push_that_the_service_did_not_survive_is_said_and_not_begun_again(url: str) -> None:
     with Store.open(url) as store:
-        store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, {"proposal": 7, "approval": 1, "text": "proposal 7 is being pushed"})
+        store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, AlarmFacts(proposal=7, approval=1, text="proposal 7 is being pushed"))
         bench = Bench(store, url, push=True)
         assert await bench.follow_up() == ""
         begun, ended = store.alarms.entries("mill-7")
-        assert (begun.kind, ended.kind, ended.doc["word"]) == ("pushing", "pushed", "failed")
-        assert ended.doc["text"].startswith("proposal 7 failed: the service ended before anything was written")
+        assert (begun.kind, ended.kind, ended.facts.word) == ("pushing", "pushed", "failed")
+        assert ended.facts.text.startswith("proposal 7 failed: the service ended before anything was written")
         assert bench.told() == [("ALM-006", 0)]
         assert await bench.follow_up() == ""
         assert len(store.alarms.entries("mill-7")) == 2
 
 
 def test_a_line_on_old_knowledge_is_refused(bench: Bench) -> None:
-    bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, {})
-    bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, {})
+    bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, AlarmFacts())
+    bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, AlarmFacts())
     with pytest.raises(StoreError, match="another process changed alarm 1 of mill-7"):
-        bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CLEARED, {})
-    assert bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, {}).alarm == NO_ALARM
-    assert bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, {}).alarm == 2
-    assert bench.store.alarms.append("mill-8", None, 0, AlarmKind.RAISED, {}).alarm == 1
+        bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CLEARED, AlarmFacts())
+    assert bench.store.alarms.append("mill-7", NO_ALARM, 0, AlarmKind.PUSHING, AlarmFacts()).alarm == NO_ALARM
+    assert bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, AlarmFacts()).alarm == 2
+    assert bench.store.alarms.append("mill-8", None, 0, AlarmKind.RAISED, AlarmFacts()).alarm == 1
     assert [e.kind for e in bench.store.alarms.entries("mill-7")] == ["raised", "held", "pushing", "raised"]
 
 

@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime
 from typing import Any
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
-from abbe.service.verification.alarm_states import Alarm, FiredRule, Signal, after_check, folded, is_open, next_step
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind, Signal
+from abbe.service.verification.alarm_states import Alarm, FiredRule, after_check, folded, is_open, next_step
 
 RECIPE = "quick-check"
+TOMORROW = datetime(2026, 11, 23, tzinfo=UTC)
 SIGNAL = Signal("helix_rms_um", "limit", 8.8, 0.2, 7.0, "helix rms 8.8 ± 0.2 µm (U, k = 2) is above its limit of 7 µm")
 BAD = FiredRule(True, "fail", (SIGNAL,))
 GOOD = FiredRule(True, "pass")
@@ -20,8 +22,8 @@ UNSURE = FiredRule(True, "cannot tell")
 NOT_MEASURED = FiredRule(False, "cannot tell")
 
 
-def entry(number: int, seq: int, kind: AlarmKind, doc: dict[str, Any], utc: str = "t") -> AlarmEntryRecord:
-    return AlarmEntryRecord(machine="mill-7", alarm=number, seq=seq, kind=kind, doc=doc, utc=utc)
+def entry(number: int, seq: int, kind: AlarmKind, facts: AlarmFacts, utc: str = "2026-11-22T00:00:00Z") -> AlarmEntryRecord:
+    return AlarmEntryRecord(machine="mill-7", alarm=number, seq=seq, kind=kind, facts=facts, utc=utc)
 
 
 @dataclass
@@ -38,17 +40,17 @@ class Book:
     def active(self) -> Alarm | None:
         return next((a for a in reversed(self.alarms) if a.active), None)
 
-    def add(self, number: int | None, kind: AlarmKind, **doc: Any) -> None:
+    def add(self, number: int | None, kind: AlarmKind, **facts: Any) -> None:
         number = number or max((line.alarm for line in self.lines), default=0) + 1
         seq = max((line.seq for line in self.lines if line.alarm == number), default=-1) + 1
-        self.lines.append(entry(number, seq, kind, doc, f"2026-11-22T00:00:{len(self.lines):02d}Z"))
+        self.lines.append(entry(number, seq, kind, AlarmFacts(**facts), f"2026-11-22T00:00:{len(self.lines):02d}Z"))
 
     def check(self, found: FiredRule) -> AlarmKind | None:
         now = self.active
         kind = after_check(now, found)
         if kind is not None:
-            doc = {"recipe": RECIPE, "schedule": "often", "verification": len(self.lines), "text": found.text}
-            self.add(None if now is None else now.number, kind, signals=[asdict(s) for s in found.signals], **doc)
+            facts = {"recipe": RECIPE, "schedule": "often", "verification": len(self.lines), "text": found.text}
+            self.add(None if now is None else now.number, kind, signals=found.signals, **facts)
         return kind
 
     def acknowledge(self, name: str = "otto") -> None:
@@ -136,17 +138,17 @@ def test_priority_comment_and_shelving(raised: Book) -> None:
     assert raised.alarms[0].priority == 3
     raised.check(GOOD)
     assert raised.alarms[0].priority == 1, "what is over keeps the priority that it was raised with"
-    raised.add(1, AlarmKind.SHELVED, name="otto", reason="spindle is being repaired", until_utc="2026-11-23T00:00:00Z")
+    raised.add(1, AlarmKind.SHELVED, name="otto", reason="spindle is being repaired", until_utc=TOMORROW)
     raised.add(1, AlarmKind.ACKNOWLEDGED, name="otto", comment="seen")
     (one,) = raised.alarms
-    assert (one.shelved_until_utc, one.comment, one.word) == ("2026-11-23T00:00:00Z", "seen", "closed")
+    assert (one.shelved_until_utc, one.comment, one.word) == (TOMORROW, "seen", "closed")
 
 
 def test_lines_that_cannot_follow_are_left_out() -> None:
     stray = [
-        entry(0, 0, AlarmKind.PUSHED, {"text": "no alarm asked for it"}),
-        entry(7, 0, AlarmKind.CONTINUED, {}),
-        entry(7, 1, AlarmKind.ACKNOWLEDGED, {}),
+        entry(0, 0, AlarmKind.PUSHED, AlarmFacts(text="no alarm asked for it")),
+        entry(7, 0, AlarmKind.CONTINUED, AlarmFacts()),
+        entry(7, 1, AlarmKind.ACKNOWLEDGED, AlarmFacts()),
     ]
     assert folded(stray) == []
 

@@ -8,7 +8,7 @@ import pytest
 
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_decisions import approve
-from abbe.service.domain.service_records import AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.queries.alarm_path import path_of_alarm, path_with
 from abbe.service.queries.reader import Reader
 from abbe.service.storage.store import Store
@@ -52,9 +52,7 @@ async def test_from_the_alarm_to_the_report(reader: Reader, filled: Filled) -> N
     await as_if_pushed(store, SystemClock(), filled.machine, {"proposal": proposal}, (b"June", b"July"), KEPT)
     assert states(reader, 2) | {"push": "done", "proof": "now"} == states(reader, 2)
     assert to_do(reader, 2) == "/new?recipe=quick-check"
-    store.alarms.append(
-        filled.machine, 2, 3, AlarmKind.CLEARED, {"verification": 20, "signals": [], "text": "pass", "recipe": "quick-check"}
-    )
+    store.alarms.append(filled.machine, 2, 3, AlarmKind.CLEARED, AlarmFacts(verification=20, text="pass", recipe="quick-check"))
     assert to_do(reader, 2) == "/api/v1/reports/verification/20"
     for key, number in (("check", 24), ("proposal", proposal), ("proof", 20)):
         found = path_with(reader, key, number)  # type: ignore[arg-type]
@@ -66,11 +64,11 @@ async def test_from_the_alarm_to_the_report(reader: Reader, filled: Filled) -> N
 def test_without_a_proposal_the_cause_is_to_be_measured_or_nothing_is_needed(reader: Reader, filled: Filled) -> None:
     store = reader.store
     first = next(e for e in store.alarms.entries(filled.machine) if e.kind == "raised")
-    number = store.alarms.append(filled.machine, None, 0, AlarmKind.RAISED, first.doc).alarm
+    number = store.alarms.append(filled.machine, None, 0, AlarmKind.RAISED, first.facts).alarm
     acknowledge(store, filled.machine, number, "olga")
     assert to_do(reader, number) == "/new?recipe=identification"
-    store.alarms.append(filled.machine, number, 2, AlarmKind.ENDED, {"text": "no proposal: nothing is known"})
+    store.alarms.append(filled.machine, number, 2, AlarmKind.ENDED, AlarmFacts(text="no proposal: nothing is known"))
     assert states(reader, number) | {"cause": "failed", "approval": "waiting"} == states(reader, number)
     assert to_do(reader, number) == ""
-    store.alarms.append(filled.machine, number, 3, AlarmKind.CLEARED, {"verification": 20, "signals": [], "text": "pass"})
+    store.alarms.append(filled.machine, number, 3, AlarmKind.CLEARED, AlarmFacts(verification=20, text="pass"))
     assert states(reader, number) | {"approval": "skipped", "push": "skipped", "proof": "done"} == states(reader, number)

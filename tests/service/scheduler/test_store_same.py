@@ -15,13 +15,14 @@ from abbe.service.domain.measured import ChunkRecord, ImportedRun, Owner
 from abbe.service.domain.people import TokenRecord
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import NewVersion
-from abbe.service.domain.service_records import AlarmKind, SlotRecord
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind, SlotRecord
 from abbe.service.errors import AbbeError
 from abbe.service.storage.database import Repository
 from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.store import Store
 
 START = datetime(2026, 11, 21, 3, 34, 5, 123456, tzinfo=UTC)
+FACTS = AlarmFacts(text="ü'\"\n\\ 工", rms_um=1e-7, verification=2**53 + 1)
 DOC: dict[str, Any] = {"µm": 0.1, "list": [None, 1e-7, -0.0], "text": "ü'\"\n\\ 工", "large": 2**53 + 1}
 BYTES = bytes(range(256))
 SLOTS = [f"2026-11-{day}T05:00:00Z" for day in (20, 21, 22, 23, 24)]
@@ -208,7 +209,7 @@ def watched(ask: Any) -> None:
         ask.verifications.counts("none"),
     )
     for seq in (0, 0, 1):
-        ask.alarms.append("mill-7", None if seq == 0 else 1, seq, AlarmKind.RAISED, DOC, [("a/alarm", {"code": "ALM-001"})])
+        ask.alarms.append("mill-7", None if seq == 0 else 1, seq, AlarmKind.RAISED, FACTS, [("a/alarm", {"code": "ALM-001"})])
     ask.alarms.entries("mill-7"), ask.alarms.entries("MILL-7")
     for name in ("mill-7", "MILL-7", "mill-7"):
         ask.heartbeats.put(name, DOC | {"name": name})
@@ -272,7 +273,7 @@ def refused(ask: Any) -> None:
     )
     ask.discoveries.add_step(1, 0, "BEGUN", DOC), ask.models.add(NewVersion("mill-7", None, DOC))
     (
-        ask.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, DOC),
+        ask.alarms.append("mill-7", 1, 1, AlarmKind.CONTINUED, FACTS),
         ask.verifications.add(77, None, "pass", DOC),
         ask.checkpoints.add(77, "begun", DOC),
     )

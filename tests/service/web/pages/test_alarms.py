@@ -20,7 +20,7 @@ def raised(running: Served) -> int:
     """A new alarm beside those of the world; its number."""
     machine = running.filled.machine
     first = next(e for e in running.store.alarms.entries(machine) if e.kind == "raised")
-    return running.store.alarms.append(machine, None, 0, first.kind, first.doc).alarm
+    return running.store.alarms.append(machine, None, 0, first.kind, first.facts).alarm
 
 
 def line_of(page: str) -> str:
