@@ -174,7 +174,7 @@ def test_the_bundle_holds_no_secret_and_stands_in_the_audit(running: Served) -> 
     whole = "".join(texts.values())
     assert [one for one in (CANARY, secret, *hashes) if one in whole] == []
     assert json.loads(texts["config.json"])["machine"] == running.filled.machine
-    assert json.loads(texts["diagnosis.json"])["size_b"] > 10_000
+    assert json.loads(texts["diagnosis.json"])["health"]["size_b"] > 10_000
     assert any(record.action == "support bundle" and record.who == "user:adam" for record in running.store.audit.events(50))
 
 

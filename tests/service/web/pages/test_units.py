@@ -55,7 +55,7 @@ def test_a_place_is_as_fine_far_out_as_near(value_mm: float, inch: str, mm: str)
 @pytest.mark.parametrize(("value", "expanded"), [(float("nan"), 2.0), (float("inf"), 2.0), (1.0, float("nan")), (1.0, float("inf"))])
 def test_an_interval_of_what_is_no_number_is_not_available(value: float, expanded: float) -> None:
     line = _interval("dX", value, expanded, "µm")
-    assert (line.low, line.high, "n/a" in (line.value, line.expanded)) == ("n/a", "n/a", True)
+    assert (line.ends, "n/a" in line.shown) == (("n/a", "n/a"), True)
 
 
 def test_units_and_factors() -> None:
