@@ -12,8 +12,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.channel.messages import PAGE_MEMORY_MB
-from abbe.service.domain.machine import Chain, Interval, Point
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, Chain, Interval, Point
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker

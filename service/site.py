@@ -12,8 +12,7 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import Limits, MachineFile
-from abbe.service.domain.machine import DeviceUrls, control_of
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, DeviceUrls, control_of
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings

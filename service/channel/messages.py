@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken

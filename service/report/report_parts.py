@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy

@@ -14,7 +14,7 @@ from abbe.models.evaluation.iso230_4 import OnePath, both_ways, centred, circula
 from abbe.models.evaluation.iso230_6 import BODY, FACE, Diagonals, diagonals
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import PictureBlock, ReportFigure
 from abbe.service.rendering.model import PolarTrace

@@ -13,7 +13,7 @@ from abbe.models.evaluation.reduction import DiagonalExpansion, Expansion, Strai
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.service.config_schema import COLDEST_C, WARMEST_C
-from abbe.service.domain.material import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.run import Run
 from abbe.service.rendering.numbers import plain, tidy, with_uncertainty
 

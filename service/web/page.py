@@ -6,19 +6,42 @@ from collections.abc import Sequence
 from datetime import UTC, datetime, tzinfo
 from functools import cache
 from pathlib import Path
+from urllib.parse import urlencode
 from zoneinfo import ZoneInfo
 
 from jinja2 import Environment, FileSystemLoader, StrictUndefined
 from markupsafe import Markup
 
 from abbe.service.domain.verification import Verification
+from abbe.service.queries.alarms import PathStep
 from abbe.service.queries.status import Status
+from abbe.service.sequences.recipes.campaigns import IDENTIFICATION
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
-from abbe.service.web.path_links import step_address
 from abbe.service.web.strip import strip_of
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
+
+SCREENS = {
+    "alarm": "/alarm?id={}",
+    "check": "/check?id={}",
+    "cause": "/discovery?id={}",
+    "proposal": "/proposal?id={}",
+    "approval": "/proposal?id={}",
+    "push": "/table#push-{}",
+    "proof": "/check?id={}",
+    "report": "/api/v1/reports/verification/{}",
+}
+
+
+def step_address(step: PathStep, to_do: bool = False) -> str:
+    """Address of a step; ``to_do``: of what the step asks for. Empty: nothing exists yet."""
+    if to_do and step.key in {"cause", "proposal", "proof"}:
+        return "/new?" + urlencode({"recipe": step.recipe or IDENTIFICATION})
+    if step.number is None or (step.key == "report" and step.state != "now"):
+        return ""
+    return SCREENS[step.key].format(step.number)
+
 
 HERE = Path(__file__).parent
 MARKS = {"pass": "✔", "fail": "✖", "cannot tell": "◐"}

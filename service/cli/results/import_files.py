@@ -231,7 +231,7 @@ def _choice(text: str, choices: Sequence[str], usual: str | None = None) -> str:
 
 def _preview(contents: Sequence[Content], answers: Answers, made: Made) -> None:
     from abbe.service.instrument_files.answers import settled
-    from abbe.service.instrument_files.preview import preview_rows
+    from abbe.service.instrument_files.registry import preview_rows
 
     for content, origin in zip(contents, made.origins, strict=True):
         print_table(("what", "value"), preview_rows(content, settled(content, answers), origin))

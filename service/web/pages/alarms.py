@@ -7,8 +7,7 @@ from collections.abc import Callable
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
-from abbe.service.queries.alarm_lines import alarm_lines
-from abbe.service.queries.alarm_path import path_of_alarm
+from abbe.service.queries.alarms import alarm_lines, path_of_alarm
 from abbe.service.queries.status import AlarmSummary, alarms
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.users.roles import Permission

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from html import escape
 
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
@@ -12,8 +13,7 @@ from markupsafe import Markup
 from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.verification import CheckFigure, Verification
 from abbe.service.errors import AbbeError, NotStored
-from abbe.service.queries.alarm_lines import alarms_of_check
-from abbe.service.queries.alarm_path import AlarmPath, path_with
+from abbe.service.queries.alarms import AlarmPath, alarms_of_check, path_with
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.results import check as stored_check
 from abbe.service.queries.results import checks
@@ -29,7 +29,6 @@ from abbe.service.users.roles import Permission
 from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, curve, incomparable_reason
 from abbe.service.web import language
 from abbe.service.web.frame import current
-from abbe.service.web.gauge import gauge_svg
 from abbe.service.web.login.access import needs
 from abbe.service.web.page import MARKS, figure_verdict, sentence
 from abbe.service.web.pages.context import Number, PageContext
@@ -185,3 +184,27 @@ def _overlay(curves: Sequence[tuple[str, ComparedCurve]], title: str, key: str) 
     frame = current()
     labels = frame.translate("compare.along", unit=place.sign), frame.translate("compare.deviation", unit=error.sign)
     return overlay_plot(lines, key=key, heading=title, labels=labels, unit=error)
+
+
+WIDTH, HEIGHT = 560.0, 44.0
+LEFT, RIGHT, MIDDLE = 2.0, 14.0, 22.0
+
+
+def gauge_svg(title: str, value: float, expanded: float | None, limit: float | None, verdict: str) -> str:
+    """The bar, from zero to beyond limit and value. All numbers in one unit; ``expanded``: U, None if unknown; ``title``: its text."""
+    u = expanded or 0.0
+    top = max(1.15 * (limit or 0.0), 1.1 * (abs(value) + u), 1e-12)
+
+    def x(at: float) -> float:
+        return LEFT + min(max(at, 0.0), top) / top * (WIDTH - LEFT - RIGHT)
+
+    kind = verdict.replace(" ", "-")
+    size = abs(value)
+    body = [f'<rect class="track" x="{LEFT:g}" y="{MIDDLE - 7:g}" width="{WIDTH - LEFT - RIGHT:g}" height="14"/>']
+    wide = max(x(size + u) - x(size - u), 1.0)
+    body.append(f'<rect class="band" x="{x(size - u):.1f}" y="{MIDDLE - 7:g}" width="{wide:.1f}" height="14"/>')
+    if limit is not None:
+        body.append(f'<path class="limit" d="M{x(limit):.1f} 2V{HEIGHT - 2:g}"/>')
+    body.append(f'<path class="mark {kind}" d="M{x(size):.1f} {MIDDLE - 12:g}l8 12l-8 12l-8 -12z"/>')
+    label = escape(title, quote=True)
+    return f'<svg class="gauge" viewBox="0 0 {WIDTH:g} {HEIGHT:g}" role="img" aria-label="{label}">{"".join(body)}</svg>'

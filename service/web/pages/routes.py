@@ -14,7 +14,7 @@ from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import same_person
 from abbe.service.errors import NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
-from abbe.service.queries.alarm_path import path_with
+from abbe.service.queries.alarms import path_with
 from abbe.service.queries.results import discoveries
 from abbe.service.queries.tables import proposals
 from abbe.service.rendering.document_data import shown

@@ -9,11 +9,11 @@ import pytest
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
-from abbe.service.queries.alarm_path import path_of_alarm, path_with
+from abbe.service.queries.alarms import path_of_alarm, path_with
 from abbe.service.queries.reader import Reader
 from abbe.service.storage.store import Store
 from abbe.service.verification.alarms import acknowledge
-from abbe.service.web.path_links import step_address
+from abbe.service.web.page import step_address
 from tests.pages_world import Filled, filled_once
 from tests.pretended_push import KEPT, as_if_pushed
 

@@ -1,4 +1,7 @@
-"""The way from an alarm to a signed report: check, cause, proposal, approval, push, proof, report. It follows from the store alone."""
+"""Alarms for people: their history with the person behind each entry, those of a check, and the way from an alarm to a signed report.
+
+The way (check, cause, proposal, approval, push, proof, report) follows from the store alone.
+"""
 
 from __future__ import annotations
 
@@ -11,9 +14,48 @@ from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import JournalChanged
 from abbe.service.queries.reader import Reader, StoredResult
 from abbe.service.queries.results import DiscoverySummary, checks, discoveries
+from abbe.service.queries.status import AlarmSummary, summaries
 from abbe.service.queries.tables import ProposalSummary, proposals, tables
+from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import PushSummary
 from abbe.service.verification.alarm_states import Alarm, folded
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AlarmLine:
+    """One entry of an alarm. ``who``: the person, empty for the service; ``verification``, ``until_utc``: None if the entry has none."""
+
+    kind: AlarmKind
+    utc: datetime
+    who: str
+    text: str
+    verification: int | None = None
+    until_utc: datetime | None = None
+
+
+def alarm_lines(store: Store, machine: str, number: int) -> list[AlarmLine]:
+    """The entries of an alarm, newest first."""
+    return [_line(one) for one in reversed(store.alarms.entries(machine)) if one.alarm == number]
+
+
+def _line(one: AlarmEntryRecord) -> AlarmLine:
+    facts = one.facts
+    return AlarmLine(
+        kind=one.kind,
+        utc=datetime.fromisoformat(one.utc),
+        who=facts.name,
+        text=facts.text or facts.comment or facts.reason,
+        verification=facts.verification,
+        until_utc=facts.until_utc,
+    )
+
+
+def alarms_of_check(store: Store, machine: str, verification: int) -> list[AlarmSummary]:
+    """The alarms that a check raised, held or cleared."""
+    entries = store.alarms.entries(machine)
+    numbers = {one.alarm for one in entries if one.facts.verification == verification}
+    return [one for one in summaries(folded(entries), every=True) if one.alarm in numbers]
+
 
 Result = TypeVar("Result", bound=StoredResult)
 Step = Literal["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
