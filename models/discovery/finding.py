@@ -19,7 +19,7 @@ from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
-from abbe.models.discovery.selection import APART, EXCLUDED, Rival, Selection, u_moment
+from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
 from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures, wandering
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping
@@ -317,10 +317,8 @@ def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[froze
     labels, waves = set[str](), []
     for i, j in permutations(range(len(found)), 2):
         second, first = found[i].pick, found[j].pick
-        if first.effect.name not in second.effect.beside or second.key != first.key or "pitch_mm" not in second.values:
-            continue
-        pitch = [p.values["pitch_mm"] for p in (first, second)]
-        if abs(pitch[0] / pitch[1] - 1.0) < 2.0 * APART:
+        if near_waves(second, first):
+            pitch = [p.values["pitch_mm"] for p in (first, second)]
             labels |= {first.label, second.label}
             location = localize_signal(
                 problem.paths, tuple(np.abs(p).sum(axis=1) for p in first.effect.signal(problem.paths, first.key, first.values))

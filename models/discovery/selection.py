@@ -44,6 +44,9 @@ FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """Price of a freedom of form of a chosen effect: this share of the price of its columns, plus a constant."""
 APART = 0.06
 """Least relative distance of a second effect's parameter from that of the first, and from the harmonics of this."""
+SIDE_BAND = 0.03
+"""A second wave nearer to the first than twice `APART`, with less than this share of its score, is a side band: the first wave's amplitude
+changes along the axis in another way than its forms allow."""
 UNSURE = 3.84
 """Chi-square below the best up to which a moment is not excluded (95 %)."""
 EXCLUDED = 12.0
@@ -250,17 +253,19 @@ def moments(paths: Sequence[Path]) -> tuple[float, ...]:
 
 def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFECTS) -> list[Selection]:
     """Select all effects that are worth their price, with backward steps after every addition."""
-    picks, problem = list(start), contest.problem
+    picks, problem, in_vain = list(start), contest.problem, list[str]()
     for _ in range(3 * most):
         rows = rows_for(problem, picks)
         form = contest.next_form(picks, rows)
         contest.look_for_more(picks, rows)
-        new = contest.next(picks, rows) if len(picks) < most else None
+        new = contest.next(picks, rows, in_vain) if len(picks) < most else None
         if form is not None and (new is None or form[2] > new.score or form[2] > 0.5 * new.score):
             picks[form[0]] = form[1]
         elif new is not None:
             picks.append(new.pick)
             picks = dropped(contest, joined(contest, swapped(contest, picks)))
+            if new.pick.label not in {p.label for p in picks}:
+                in_vain.append(new.pick.label)
         else:
             break
     return weighed(contest, dropped(contest, picks))
@@ -304,14 +309,26 @@ def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Drop the pick with the lowest score given the others, until every score is positive."""
+    """Drop side bands, and the pick with the lowest score given the others, until every score is positive."""
     while picks:
         found = weighed(contest, picks)
-        worst = min(found, key=lambda f: f.score)
-        if worst.score > 0.0:
+        bands = [f for f in found if _side_band(f, found)]
+        worst = bands[0] if bands else min(found, key=lambda f: f.score)
+        if worst.score > 0.0 and not bands:
             return picks
         picks = [f.pick for f in found if f is not worst]
     return picks
+
+
+def near_waves(second: Pick, first: Pick) -> bool:
+    """Whether ``second`` is a second wave beside ``first``, on the same axis, at a pitch too near to be another one."""
+    if first.effect.name not in second.effect.beside or second.key != first.key or "pitch_mm" not in second.values:
+        return False
+    return abs(first.values["pitch_mm"] / second.values["pitch_mm"] - 1.0) < 2.0 * APART
+
+
+def _side_band(small: Selection, found: Sequence[Selection]) -> bool:
+    return any(near_waves(small.pick, f.pick) and small.score < SIDE_BAND * f.score for f in found)
 
 
 def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:

@@ -27,7 +27,8 @@ VISIBLE = 1.05
 CLOSED = 0.5
 """Share of the gap (`GapUm.closed`) that must close on the holdout runs. A wrong effect closes it on the fitted runs only."""
 LEFT = 1.5
-"""Unproved effects explain a gap only if they leave less than this multiple of the noise."""
+"""Unproved effects explain a gap only if they leave less than this multiple of the noise. Less of a gap than this may also be the
+prediction's own error, so what remains of it refutes no effect with which the holdout runs agree better."""
 WORSE = 1.05
 """Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0
@@ -137,5 +138,9 @@ def _judged(finding: Finding, *, moving: bool) -> Judgement:
     if not moving:
         rule = "an effect that only adds scatter closes no gap: judged by evidence alone"
         return Judgement(rule=rule, proved=None, closed=share, gap=gap)
+    if share < CLOSED and gap.after_um < min(gap.before_um, LEFT * gap.floor_um):
+        return Judgement(
+            rule="the holdout runs agree better with the effect, but show too little of the gap", proved=None, closed=share, gap=gap
+        )
     rule = f"at least {CLOSED:.0%} of the gap closes on the holdout runs"
     return Judgement(rule=rule, proved=share >= CLOSED, closed=share, gap=gap)
