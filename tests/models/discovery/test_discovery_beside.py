@@ -56,6 +56,17 @@ def test_a_wave_whose_pitch_changes_along_the_axis_gets_no_pitch() -> None:
     assert (found.location.axes, found.location.shape) == (("X",), "its period is not constant")
 
 
+def test_a_wave_with_a_faint_one_close_by_is_one_wave_whose_amplitude_changes() -> None:
+    def swelling(path: Path) -> F1:
+        x = path.at.q_mm[:, 0]
+        return np.asarray(3.0 * np.sin(2.0 * np.pi * x / 20.0) + 0.4 * np.cos(2.0 * np.pi * x / 21.5))
+
+    (effect,) = discover(moved(swelling), WAVES).effects
+    assert effect.label == "cyclic_error:X"
+    assert effect.parameters["pitch_mm"][0] == pytest.approx(20.0, rel=0.002)
+    assert abs(effect.strength) == pytest.approx(3.0, rel=0.05)
+
+
 def test_a_lost_motion_from_some_moment_on_is_named_with_that_moment() -> None:
     found = discover(moved(lambda path: -2.5 * path.at.sign[:, 0] * (path.at.t_s >= BEGIN_S)), TURNS)
     (effect,) = found.effects
