@@ -90,10 +90,14 @@ def _binding(world: Any, image: bytes) -> str:
     return hashlib.sha256(text.encode()).hexdigest()
 
 
-def i7_approved_is_what_was_staged(world: Any) -> bool:
+def only_approved(world: Any, forward: list[bytes]) -> bool:
+    """Each of these images was approved for exactly the base of the snapshot."""
     approved = [entry.doc["approval"] for _, entry, _, _, _ in _records(world) if "approval" in entry.doc]
-    forward = [e for e in _of(world, "activated") if e[2] != world.base]
-    return all(approved and approved[0] == _binding(world, content) for _, _, content, *_ in forward)
+    return all(approved and approved[0] == _binding(world, image) for image in forward)
+
+
+def i7_approved_is_what_was_staged(world: Any) -> bool:
+    return only_approved(world, [e[2] for e in _of(world, "activated") if e[2] != world.base])
 
 
 def i8_base_as_approved_when_activated(world: Any) -> bool:

@@ -76,7 +76,7 @@ MUTANTS: dict[str, Edits] = {
         ),
     ),
     "another's lease not respected": (
-        ("machine", "if isinstance(known.verdict, Refused):\n        return _abandon(f, known, PushState.APPROVED", "if False:\n        return _abandon(f, known, PushState.APPROVED"),
+        ("machine", "if isinstance(known.verdict, OperationRefused):\n        return _abandon(f, known, PushState.APPROVED", "if False:\n        return _abandon(f, known, PushState.APPROVED"),
         ("machine", "if isinstance(known.verdict, Done):\n        return record(PushState.LEASED)", "if known.verdict is not None:\n        return record(PushState.LEASED)"),
         ("machine", 'if truth.owner != f.owner:', "if False:"),
     ),

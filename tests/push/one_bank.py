@@ -180,7 +180,7 @@ class OneBankWorld(World):
         try:
             return await self._do(op)
         except Refused as error:
-            return o.Refused(str(error))
+            return o.OperationRefused(str(error))
         except (NoAnswer, DriverError) as error:
             self.events.append(("doubt", self.process))
             return o.Doubt(str(error))
@@ -243,23 +243,14 @@ def i6_full_read_back_before_it_acts(world: Any) -> bool:
 
 
 def i7_approved_is_what_acts(world: Any) -> bool:
-    approved = [entry.doc["approval"] for _, entry, _, _, _ in invariants._records(world) if "approval" in entry.doc]
-    forward = [world.events[k] for k in _switched_on(world) if world.events[k][2] != world.base]
-    return all(approved and approved[0] == invariants._binding(world, event[2]) for event in forward)
+    acting = [world.events[k][2] for k in _switched_on(world)]
+    return invariants.only_approved(world, [image for image in acting if image != world.base])
 
 
 def i8_base_as_approved_when_exchanged(world: Any) -> bool:
     """What was switched off for the new table was the approved base: the control compares its CRC."""
     offs = [event for event in world.events if event[0] == "switched" and not event[1]]
     return not offs or offs[0][2] == world.base
-
-
-def i9_base_restorable(world: Any) -> bool:
-    if not world.journal:
-        return True
-    doc = world.journal[0].doc
-    image = bytes.fromhex(doc["base_image"])
-    return zlib.crc32(image) == doc["base_crc"] and (image == world.base or image in world.ctl.human or image == world.ctl.factory)
 
 
 def i10_terminal_agrees_with_controller(world: Any) -> bool:
@@ -326,7 +317,7 @@ def i18_ends_in_bounded_time(world: Any) -> bool:
 
 WEAKER = {
     "I2": i2_never_written_while_it_acts, "I3": i3_interlocks_looked_at_before_each_exchange, "I6": i6_full_read_back_before_it_acts,
-    "I7": i7_approved_is_what_acts, "I8": i8_base_as_approved_when_exchanged, "I9": i9_base_restorable,
+    "I7": i7_approved_is_what_acts, "I8": i8_base_as_approved_when_exchanged,
     "I10": i10_terminal_agrees_with_controller, "I12": i12_one_pusher, "I13": i13_hand_edits_survive, "I18": i18_ends_in_bounded_time,
     "T1": t1_taken_back,
 }  # fmt: skip

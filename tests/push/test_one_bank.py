@@ -30,7 +30,7 @@ MUTANTS: dict[str, Edits] = {
     "table that is off taken for the new one": (("back", 'return "off"', 'return "candidate"'),),
     "foreign content overwritten": (("back", "if step is not None and _mixed(", "if step is not None or _mixed("),),
     "not restored after an interruption": (("machine", 'if which in ("candidate", "off"):', 'if which == "candidate":'),),
-    "a person's switching off overridden": (("machine", 'if which == "off" and isinstance(known.verdict, Refused):', "if False:"),),
+    "a person's switching off overridden": (("machine", 'if which == "off" and isinstance(known.verdict, OperationRefused):', "if False:"),),
     "unattended at level 1": (("limits", "if level in (1, 2):\n        return \"\" if attended else NEEDS_ATTENDANCE", 'if level in (1, 2):\n        return ""'),),
     "e-stop not looked at": (("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe else ""', 'return ""'),),
     "a refusal after switching off told as nothing changed": (("one_bank", "except Refused as error:\n            raise DeviceFault", "except ZeroDivisionError as error:\n            raise DeviceFault"),),

@@ -219,7 +219,7 @@ class World:
 
     def _read(self, op: Any) -> Any:
         data = self._take(op.bank, 0, op.count, "read")
-        return self.p.operations.Done(data) if data else self.p.operations.Refused("no image")
+        return self.p.operations.Done(data) if data else self.p.operations.OperationRefused("no image")
 
     def _read_again(self, op: Any) -> Any:
         data = self._take(op.bank, 0, op.count, "read_again")
@@ -232,14 +232,14 @@ class World:
         ctl = self.ctl
         bad = op.data[:-1] + bytes([op.data[-1] ^ 2])
         result = self.request("write", lambda: ctl.write(op.bank, op.first, op.data), lambda: ctl.write(op.bank, op.first, bad))
-        return self.p.operations.Done() if result == c.OK else self.p.operations.Refused("the bank is active")
+        return self.p.operations.Done() if result == c.OK else self.p.operations.OperationRefused("the bank is active")
 
     def _command(self, command: int, op: Any) -> Any:
         """As drivers/links/words.py does: ask the number, send once, let the acknowledge decide."""
         o, ctl = self.p.operations, self.ctl
         boot, ack = self.request("look", lambda: (ctl.boot, ctl.ack))
         if boot != self.boot:
-            return o.Refused("the controller restarted")
+            return o.OperationRefused("the controller restarted")
         number, doubt = (ack + 1) & 0xFFFF, False
         try:
             self.request("command", lambda: ctl.command(number, command, op.bank, op.crc, op.gen, op.owner))
@@ -250,7 +250,7 @@ class World:
             return o.Doubt("the controller restarted")
         if ack != number:
             return o.Doubt("not acknowledged")
-        return o.Done() if result == c.OK else o.Refused(f"result {result}")
+        return o.Done() if result == c.OK else o.OperationRefused(f"result {result}")
 
     def _lease(self, op: Any) -> Any:
         return self._command(c.LEASE, op)
@@ -283,7 +283,7 @@ class World:
 
     def _approve(self, op: Any) -> Any:
         if self.case.approved == "no":
-            return self.p.operations.Refused("no")
+            return self.p.operations.OperationRefused("no")
         f = self.p.journal.facts(self.journal)
         if self.case.approved == "another table":
             f = replace(f, image=self.base)
@@ -300,7 +300,7 @@ class World:
         moved = self.case.machine_sign * int.from_bytes(self.ctl.in_force[-2:], "big", signed=True)
         wanted = round(float(tables(55).correction_mm[2][1, 2]) * 1e4)
         self.events.append(("probed", self.ctl.in_force, moved == wanted))
-        return self.p.operations.Verdict(moved == wanted and not self.ctl.estop, f"moved {moved}, wanted {wanted}")
+        return self.p.operations.VerificationResult(moved == wanted and not self.ctl.estop, f"moved {moved}, wanted {wanted}")
 
     def _verify(self, op: Any) -> Any:
         return self._question(self._verified)
@@ -308,7 +308,7 @@ class World:
     def _verified(self) -> Any:
         good = self.case.verify and self.ctl.in_force == self.candidate and not self.ctl.estop
         self.events.append(("verified", self.ctl.in_force, good))
-        return self.p.operations.Verdict(good, "better" if good else "not better")
+        return self.p.operations.VerificationResult(good, "better" if good else "not better")
 
     # ---- the journal --------------------------------------------------------------------------------------------------------
 

@@ -70,7 +70,8 @@ def _tables() -> tuple[Compensation, Compensation]:
 
 def _seen(control: Path, name: str) -> list[dict[str, Any]]:
     """Start the control, run a probe beside it, end it; return what the probe saw."""
-    shutil.copy(Path(__file__).with_name(name), control)
+    for script in (name, "probe_control.py"):
+        shutil.copy(Path(__file__).with_name(script), control)
     apart = ["unshare", "-n", "-i", "-p", "-f", "--mount-proc", "-m", "sh", "-c", SCRIPT, "sh", str(control), str(control / name)]
     said = subprocess.run(apart, capture_output=True, text=True, timeout=100, check=False)
     assert (control / "seen.json").exists(), said.stdout + said.stderr + (control / "run.log").read_text()
