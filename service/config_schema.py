@@ -7,12 +7,12 @@ from collections import Counter
 from datetime import date
 from typing import Annotated, Literal, Self
 
-from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.channel.messages import PAGE_MEMORY_MB
-from abbe.service.domain.machine import AxisMaterial, Chain, Interval, Point
+from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Point
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
@@ -55,12 +55,6 @@ EXCLUSIVE_KEYS = {
 }
 """Keys of the two ways to write an entry of a list; an entry uses one of them."""
 Certificate = Annotated[date | None, AfterValidator(_certificate)]
-
-
-class ConfigTable(BaseModel):
-    """A table of the machine file: no unknown key, no NaN, immutable."""
-
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
 
 
 class AxisIntervals(ConfigTable):
@@ -248,19 +242,6 @@ class Calibration(ConfigTable):
     laser: Certificate = Field(default=None, description="of the laser")
 
 
-class IssuerSection(ConfigTable):
-    """Who issues digital calibration certificates (`abbe report --out FILE.xml`)."""
-
-    laboratory: str = Field(min_length=1, max_length=200)
-    city: str = Field(min_length=1, max_length=200)
-    country: str = Field(pattern="^[A-Z]{2}$", description="ISO 3166-1, two letters")
-    person: str = Field(min_length=1, max_length=200, description="who is responsible")
-    customer: str = Field(default="", max_length=200, description="of the machine; empty: the laboratory itself")
-    place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
-        default="customer", description="where machines are measured, as seen from the laboratory"
-    )
-
-
 class Nc(ConfigTable):
     """The controller that NC programs are written for (`abbe measure --nc`)."""
 
@@ -439,7 +420,7 @@ class MachineFile(ConfigTable):
     limits: Limits = Limits()
     material: Material = Material()
     calibration: Calibration = Calibration()
-    issuer: IssuerSection | None = None
+    issuer: Issuer | None = None
     nc: Nc = Nc()
     verify: Verify = Verify()
     mqtt: Mqtt = Mqtt()

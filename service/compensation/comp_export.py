@@ -136,18 +136,18 @@ def control_for(key: str) -> ControlModel:
         raise FormatRefused(f"there is no format or control {key!r}", f"formats: {', '.join(FORMATS)}; controls: {', '.join(CONTROLS)}")
     form = FORMATS[key]
     for c in CONTROLS.values():
-        if key in (c.own, c.lattice, c.motions, c.lines) and c.cross in ("", key):
-            return replace(c, own=key if c.own == key else "", lattice=key if c.lattice == key else "")
+        if key in (c.own_format, c.lattice_format, c.motions_format, c.lines_format) and c.cross_format in ("", key):
+            return replace(c, own_format=key if c.own_format == key else "", lattice_format=key if c.lattice_format == key else "")
     points = min(form.limits.points, 101)
     shared = key if form.limits.cross else ""
-    home = next((c for c in CONTROLS.values() if key in (c.own, c.cross)), ControlModel(key, form.name))
+    home = next((c for c in CONTROLS.values() if key in (c.own_format, c.cross_format)), ControlModel(key, form.name))
     return replace(
         home,
         key=key,
         name=form.name,
-        own=key,
+        own_format=key,
         own_points=points,
-        cross=shared,
+        cross_format=shared,
         cross_points=min(points, home.cross_points),
         products=form.limits.products,
         both_directions=form.limits.directional,
@@ -234,14 +234,14 @@ def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings
     """
     own = Compensation(comp.own)
     cross = Compensation(comp.cross, comp.products)
-    if control.own == control.cross:
+    if control.own_format == control.cross_format:
         own, cross = Compensation(comp.tables, comp.products), Compensation()
     parts = (
-        (control.own, own),
-        (control.cross, cross),
-        (control.lattice, Compensation(lattice=comp.lattice)),
-        (control.motions, Compensation(motions=comp.motions)),
-        (control.lines, replace(comp, lost_motion_mm=comp.lost_motion_mm if holds_lost_motion(control) else {})),
+        (control.own_format, own),
+        (control.cross_format, cross),
+        (control.lattice_format, Compensation(lattice=comp.lattice)),
+        (control.motions_format, Compensation(motions=comp.motions)),
+        (control.lines_format, replace(comp, lost_motion_mm=comp.lost_motion_mm if holds_lost_motion(control) else {})),
     )
     out: list[TextFile] = []
     for key, part in parts:
@@ -274,7 +274,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool, turned: bo
 
 def holds_lost_motion(control: ControlModel) -> bool:
     """Whether the files of a control hold its backlash parameter."""
-    return bool(control.lines) and control.lost_motion
+    return bool(control.lines_format) and control.lost_motion
 
 
 def expected(known: Identified, control: ControlModel, reference_mm: F1 | None = None) -> Compensation:
@@ -286,7 +286,7 @@ def expected(known: Identified, control: ControlModel, reference_mm: F1 | None =
 
 def alike_mm(control: ControlModel) -> float:
     """Return the largest difference by rounding between tables read and expected, mm; of error motions, several add up."""
-    return (MOTIONS_ADD_UP if control.motions else 1.0) * 0.51 * control.unit_mm + 1e-6
+    return (MOTIONS_ADD_UP if control.motions_format else 1.0) * 0.51 * control.unit_mm + 1e-6
 
 
 def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings, *, turned: bool = False) -> Compensation:
@@ -339,7 +339,11 @@ def belongs(file: TextFile, key: str) -> bool:
 
 def formats_in(control: ControlModel) -> tuple[str, ...]:
     """Formats that a control reads. Where there are several, file names distinguish them, so the files always go into a folder."""
-    return tuple(dict.fromkeys(k for k in (control.own, control.cross, control.lattice, control.motions, control.lines) if k))
+    return tuple(
+        dict.fromkeys(
+            k for k in (control.own_format, control.cross_format, control.lattice_format, control.motions_format, control.lines_format) if k
+        )
+    )
 
 
 def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:

@@ -152,3 +152,22 @@ class AxisMaterial:
     laser_per_k: float
     workpiece_per_k: float | None = None
     u_workpiece_per_k: float | None = None
+
+
+class ConfigTable(BaseModel):
+    """A table of the machine file: no unknown key, no NaN, immutable."""
+
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+
+
+class Issuer(ConfigTable):
+    """Who issues digital calibration certificates (`abbe report --out FILE.xml`)."""
+
+    laboratory: str = Field(min_length=1, max_length=200)
+    city: str = Field(min_length=1, max_length=200)
+    country: str = Field(pattern="^[A-Z]{2}$", description="ISO 3166-1, two letters")
+    person: str = Field(min_length=1, max_length=200, description="who is responsible")
+    customer: str = Field(default="", max_length=200, description="of the machine; empty: the laboratory itself")
+    place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
+        default="customer", description="where machines are measured, as seen from the laboratory"
+    )

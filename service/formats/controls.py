@@ -26,19 +26,19 @@ class ControlModel:
 
     Attributes
     ----------
-    own, cross : str
+    own_format, cross_format : str
         Format of own-axis tables (an axis corrects itself), and of cross and product tables; empty if the control has none.
     own_points, cross_points : int
         Largest number of points of a table.
     both_directions : bool
         Own-axis tables have two columns. Otherwise the control's backlash parameter holds the lost motion.
     tables : int, optional
-        Largest number of tables of the ``cross`` format, of which a product takes two; None: unlimited.
-    lattice, nodes : str, int
+        Largest number of tables of the ``cross_format``, of which a product takes two; None: unlimited.
+    lattice_format, nodes : str, int
         Format of a 3-D grid, and its nodes per axis.
-    motions : str
+    motions_format : str
         Format of the error motions from which the control computes corrections by its own kinematic chain.
-    lines, squareness, lost_motion : str, bool, bool
+    lines_format, squareness, lost_motion : str, bool, bool
         Format of commands, and what they hold.
     lookup : str
         Position at which the control looks up all tables but the own-axis ones.
@@ -48,17 +48,17 @@ class ControlModel:
 
     key: str
     name: str
-    own: str = ""
+    own_format: str = ""
     own_points: int = 25
     both_directions: bool = True
-    cross: str = ""
+    cross_format: str = ""
     cross_points: int = 25
     products: bool = False
     tables: int | None = None
-    lattice: str = ""
+    lattice_format: str = ""
     nodes: int = 0
-    motions: str = ""
-    lines: str = ""
+    motions_format: str = ""
+    lines_format: str = ""
     squareness: bool = True
     lost_motion: bool = True
     lookup: Lookup = "command"
@@ -71,58 +71,63 @@ CONTROLS: dict[str, ControlModel] = {
         ControlModel(
             "linuxcnc",
             "LinuxCNC: COMP_FILE and HAL network",
-            own="linuxcnc-1",
+            own_format="linuxcnc-1",
             own_points=101,
-            cross="linuxcnc-hal",
+            cross_format="linuxcnc-hal",
             cross_points=16,
             products=True,
         ),
-        ControlModel("linuxcnc-kins", "LinuxCNC: kinematics component", lattice="linuxcnc-kins", nodes=33),
+        ControlModel("linuxcnc-kins", "LinuxCNC: kinematics component", lattice_format="linuxcnc-kins", nodes=33),
         ControlModel(
             "siemens-840d",
             "SINUMERIK 840D sl: ENC_COMP and CEC",
-            own="siemens-eec",
+            own_format="siemens-eec",
             own_points=101,
             both_directions=False,
-            cross="siemens-cec",
+            cross_format="siemens-cec",
             products=True,
         ),
         ControlModel(
             "siemens-828d",
             "SINUMERIK 828D with the option: ENC_COMP and 8 CEC tables",
-            own="siemens-eec",
+            own_format="siemens-eec",
             own_points=101,
             both_directions=False,
-            cross="siemens-cec",
+            cross_format="siemens-cec",
             products=True,
             tables=8,
         ),
-        ControlModel("fanuc", "Fanuc with pitch error compensation only", own="fanuc-pitch", own_points=101, unit_mm=1e-3),
+        ControlModel("fanuc", "Fanuc with pitch error compensation only", own_format="fanuc-pitch", own_points=101, unit_mm=1e-3),
         ControlModel(
-            "fanuc-30i", "Fanuc 30i with 3-D error compensation", own="fanuc-pitch", lattice="fanuc-lattice", nodes=9, unit_mm=1e-3
+            "fanuc-30i",
+            "Fanuc 30i with 3-D error compensation",
+            own_format="fanuc-pitch",
+            lattice_format="fanuc-lattice",
+            nodes=9,
+            unit_mm=1e-3,
         ),
         ControlModel(
             "heidenhain",
             "Heidenhain TNC: .COM tables",
-            own="heidenhain",
+            own_format="heidenhain",
             own_points=101,
             cross_points=101,
-            cross="heidenhain",
+            cross_format="heidenhain",
             unit_mm=1e-4,
         ),
         ControlModel(
             "heidenhain-kinematics",
             "Heidenhain TNC with KinematicsComp: 18 motions and squareness",
-            motions="heidenhain-kinematics",
+            motions_format="heidenhain-kinematics",
             own_points=101,
             unit_mm=1e-4,
         ),
-        ControlModel("isg", "Beckhoff/ISG kernel with TF5280", motions="isg"),
-        ControlModel("mach4", "Mach4", own="mach4", own_points=101, unit_mm=1e-4),
-        ControlModel("centroid", "Centroid CNC10 v2.61 to CNC12, table version 3", own="centroid", own_points=101, unit_mm=1e-4),
-        ControlModel("marlin", "Marlin: squareness and lost motion", lines="marlin"),
-        ControlModel("klipper", "Klipper: squareness", lines="klipper", lost_motion=False),
-        ControlModel("grblhal", "grblHAL: lost motion", lines="grblhal", squareness=False),
+        ControlModel("isg", "Beckhoff/ISG kernel with TF5280", motions_format="isg"),
+        ControlModel("mach4", "Mach4", own_format="mach4", own_points=101, unit_mm=1e-4),
+        ControlModel("centroid", "Centroid CNC10 v2.61 to CNC12, table version 3", own_format="centroid", own_points=101, unit_mm=1e-4),
+        ControlModel("marlin", "Marlin: squareness and lost motion", lines_format="marlin"),
+        ControlModel("klipper", "Klipper: squareness", lines_format="klipper", lost_motion=False),
+        ControlModel("grblhal", "grblHAL: lost motion", lines_format="grblhal", squareness=False),
     )
 }
 
@@ -189,19 +194,19 @@ def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple
     """Evaluate every kind of tables that the control can hold, from none to all, and mark the best."""
     judge = FormatJudge(known, control)
     found = [judge.choice("no table", Compensation())]
-    if control.own:
+    if control.own_format:
         build = _Builder(known, control, reference_mm)
         found.append(judge.choice("one-axis tables", build.together((), ())))
-        found += _crossed(control, build, judge) if control.cross else []
-    if control.lattice:
+        found += _crossed(control, build, judge) if control.cross_format else []
+    if control.lattice_format:
         nodes = _grids(known, control.nodes, reference_mm)
         grid = Compensation(lattice=lattice_of(known, nodes, reference_mm), lost_motion_mm=dict(known.lost_motion_mm))
         found.append(judge.choice(f"3-D grid of {' x '.join(str(g.size) for g in nodes)} nodes", grid))
-    if control.motions:
+    if control.motions_format:
         grids = _grids(known, control.own_points, reference_mm)
         comp = Compensation(motions=motions_of(known, grids), lost_motion_mm=dict(known.lost_motion_mm))
         found.append(judge.choice("error motions, worked out by the control", comp))
-    if control.lines:
+    if control.lines_format:
         found += [judge.choice(kind, comp) for kind, comp in _lines(known, control, reference_mm)]
     return _marked(found)
 

@@ -11,8 +11,9 @@ import xml.etree.ElementTree as ET
 from importlib.metadata import version
 from itertools import groupby
 
+from abbe.service.domain.machine import Issuer
 from abbe.service.errors import FileFormatError
-from abbe.service.rendering.document import DECISION_RULE, UNCERTAINTY, Document, Issuer, ReportFigure
+from abbe.service.rendering.document import DECISION_RULE, UNCERTAINTY, Document, ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite, printable, tidy
 
 SCHEMA = "3.3.0"

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
+from abbe.service.domain.machine import Issuer
 from abbe.service.rendering.numbers import COVERAGE
 
 FORMAT = "abbe-report/1"
@@ -48,18 +49,6 @@ class Instrument:
     name: str
     certificate: str
     known: str
-
-
-@dataclass(frozen=True, slots=True)
-class Issuer:
-    """Who issues a digital certificate. ``country``: ISO 3166-1, two letters; ``customer``: empty: itself; ``place``: of measuring."""
-
-    laboratory: str
-    city: str
-    country: str
-    person: str
-    customer: str = ""
-    place: str = "customer"
 
 
 @dataclass(frozen=True, slots=True)

@@ -20,7 +20,7 @@ from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError, TableMismatch
 from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts, push_log
-from abbe.service.rendering.document import Document, Issuer, PictureBlock, ReportFigure, Section, Sign, TextTable
+from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.report import report_parts as parts
@@ -255,7 +255,7 @@ def rules_of(config: MachineFile | None) -> Rules:
 def certified(document: Document, config: MachineFile | None, measured_on: date | None) -> Document:
     """The report with the issuer of a digital certificate from a machine file and, where it has none, the day of the measurement."""
     days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
-    issuer = None if config is None or config.issuer is None else Issuer(**config.issuer.model_dump())
+    issuer = None if config is None else config.issuer
     return replace(document, issuer=issuer, days=days)
 
 

@@ -16,19 +16,27 @@ LEAST_READINGS = 5
 MOST_LOST = 1e-3
 
 
-@dataclass(frozen=True, slots=True)
-class ReadProgress:
-    """Progress of a path: its pieces, the last one up to the end of its constant feed, and the readings of the last piece.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathReadings:
+    """What was read of a path before its interruption: its valid ``pieces``, and the readings that the rest is compared with.
 
-    ``counted_from_mm``: start of the counted part of the last piece; ``arc_mm`` and ``deviation_mm``, shape (n,): position along the whole
-    path and reading, mm; ``boot_id``: of the ball-bar's box.
+    ``arc_mm`` and ``deviation_mm``, shape (n,): position along the path and reading, mm; ``boot_id``: of the ball-bar's box.
     """
 
     pieces: tuple[RunPiece, ...]
-    counted_from_mm: float
     arc_mm: F1
     deviation_mm: F1
     boot_id: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadProgress(PathReadings):
+    """Progress of a path: its pieces, the last one up to the end of its constant feed, and the readings of the last piece.
+
+    ``counted_from_mm``: start of the counted part of the last piece; ``arc_mm`` counts along the whole path.
+    """
+
+    counted_from_mm: float
 
 
 def progress_of(record: RunRecord, columns: Columns) -> ReadProgress | None:
@@ -49,7 +57,13 @@ def progress_of(record: RunRecord, columns: Columns) -> ReadProgress | None:
         return None
     pieces = (*path.pieces, RunPiece(record.id, path.offset_mm + good_mm))
     read_mm = columns.readings_mm[columns.valid]
-    return ReadProgress(pieces, path.offset_mm + counted_mm, path.offset_mm + at_mm[known], read_mm[known], end.box_boot_id)
+    return ReadProgress(
+        pieces=pieces,
+        counted_from_mm=path.offset_mm + counted_mm,
+        arc_mm=path.offset_mm + at_mm[known],
+        deviation_mm=read_mm[known],
+        boot_id=end.box_boot_id,
+    )
 
 
 def along_mm(start: RunStart, end: RunEnd, columns: Columns) -> F1:

@@ -22,7 +22,7 @@ from abbe.drivers.api import BarSample, ControllerStatus, bar_is_valid, on_path
 from abbe.models.arrays import F1
 from abbe.service.domain.measured import RunPiece, arc_of
 from abbe.service.errors import RunInterrupted, SetupDisturbed, StretchDiffers
-from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, ReadProgress
+from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, PathReadings, ReadProgress
 from abbe.service.sequences.recipes.approach import cup_of, over_pole
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -108,20 +108,16 @@ class PathProgress:
         return {"path_start_us": self.start_us, "good_us": self.good_us, "box_boot_id": self.boot_id}
 
 
-@dataclass(frozen=True, slots=True)
-class PathRemainder:
-    """Rest of an interrupted path: valid ``pieces``, and ``offset_mm``, the length of the whole path at which the rest begins.
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PathRemainder(PathReadings):
+    """Rest of an interrupted path, from ``offset_mm`` of its whole length ``whole_mm`` on, and the earlier readings on the stretch.
 
-    ``arc_mm`` and ``deviation_mm``, shape (n,): earlier readings on the stretch, by length along the rest; ``boot_id``: of the box then.
+    ``arc_mm`` counts along the rest.
     """
 
-    pieces: tuple[RunPiece, ...]
     offset_mm: float
     whole_mm: float
     feed_mm_s: float
-    arc_mm: F1
-    deviation_mm: F1
-    boot_id: int
 
     def doc(self) -> dict[str, Any]:
         """Return the JSON object for ``path`` in the start document."""
@@ -146,8 +142,19 @@ def rest_of_path(step: RecordPath, so_far: ReadProgress) -> tuple[RecordPath, in
     rest = RecordPath(step.points_mm[begin:], step.feed_mm_min, step.rate_hz, step.direction, (twice - begin, ends - begin))
     pieces = (*so_far.pieces[:-1], RunPiece(so_far.pieces[-1].run, float(arc[twice])))
     offset = float(arc[begin])
-    known = (so_far.arc_mm[on] - offset, so_far.deviation_mm[on])
-    return rest, begin, PathRemainder(pieces, offset, float(arc[-1]), feed_mm_s, *known, so_far.boot_id)
+    return (
+        rest,
+        begin,
+        PathRemainder(
+            pieces=pieces,
+            offset_mm=offset,
+            whole_mm=float(arc[-1]),
+            feed_mm_s=feed_mm_s,
+            arc_mm=so_far.arc_mm[on] - offset,
+            deviation_mm=so_far.deviation_mm[on],
+            boot_id=so_far.boot_id,
+        ),
+    )
 
 
 def _before(arc: F1, at_mm: float) -> int:

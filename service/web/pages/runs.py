@@ -110,13 +110,12 @@ Translate = Callable[..., str]
 
 @dataclass(frozen=True, slots=True)
 class ComparedLine:
-    """A figure in the reader's unit: value and U of each run, last minus first; ``differs``: yes, no, cannot tell."""
+    """A figure in the reader's ``unit``: value and U of each run, last minus first; ``differs``: yes, no, cannot tell."""
 
-    symbol: str
-    name: str
+    figure: FigureRow
     unit: str
-    values: Sequence[tuple[str, str]]
-    difference: tuple[str, str]
+    shown: Sequence[tuple[str, str]]
+    change: tuple[str, str]
     differs: str
 
 
@@ -182,8 +181,8 @@ def _feed(mm_min: float) -> str:
 def _line(row: FigureRow) -> ComparedLine:
     frame = current()
     differs = "cannot tell" if row.sure is None else "yes" if row.sure else "no"
-    values = [frame.with_u(v, u, row.unit) for v, u in row.values]
-    return ComparedLine(row.symbol, row.name, frame.unit(row.unit), values, frame.with_u(row.difference, row.u, row.unit), differs)
+    shown = [frame.with_u(v, u, row.unit) for v, u in row.values]
+    return ComparedLine(row, frame.unit(row.unit), shown, frame.with_u(row.difference, row.u, row.unit), differs)
 
 
 def _summary(change: RunDifference, translate: Translate) -> str:

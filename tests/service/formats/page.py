@@ -64,10 +64,20 @@ def page() -> str:
         text += f"| `{p.format}` | {p.what} | {lines} | {at}, moving in {way} | {p.axis} {p.added_mm * 1e3:+.3f} µm |\n"
     text += _CEC + _CONTROLS
     for c in CONTROLS.values():
-        own = f"`{c.own}`, {c.own_points} points, {'both directions' if c.both_directions else 'one direction'}" if c.own else "none"
-        cross = f"`{c.cross}`, {c.cross_points} points" + (", products" if c.products else "") if c.cross else "none"
+        own = (
+            f"`{c.own_format}`, {c.own_points} points, {'both directions' if c.both_directions else 'one direction'}"
+            if c.own_format
+            else "none"
+        )
+        cross = f"`{c.cross_format}`, {c.cross_points} points" + (", products" if c.products else "") if c.cross_format else "none"
         cross += f", at most {c.tables} tables" if c.tables is not None else ""
-        rest = f"`{c.lattice}`, {c.nodes} nodes an axis" if c.lattice else f"`{c.motions or c.lines}`" if c.motions or c.lines else "none"
+        rest = (
+            f"`{c.lattice_format}`, {c.nodes} nodes an axis"
+            if c.lattice_format
+            else f"`{c.motions_format or c.lines_format}`"
+            if c.motions_format or c.lines_format
+            else "none"
+        )
         text += f"| `{c.key}` | {c.name} | {own} | {cross} | {rest} | {c.lookup} |\n"
     return text
 

@@ -19,10 +19,11 @@ from signxml.exceptions import InvalidDigest
 from xmlschema import XMLResource, XMLSchema10
 from xmlschema.exceptions import XMLResourceParseError
 
+from abbe.service.domain.machine import Issuer
 from abbe.service.errors import FileFormatError
 from abbe.service.rendering.aqdef import document_dfq
 from abbe.service.rendering.certificate import UNITS, document_dcc
-from abbe.service.rendering.document import Document, Instrument, Issuer, ReportFigure
+from abbe.service.rendering.document import Document, Instrument, ReportFigure
 
 NOT_CLOSED = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 """aqdefreader leaves its file to the garbage collector."""
@@ -46,7 +47,7 @@ DOCUMENT = Document(
     not_observable=["straightness"],
     provenance={"Data (SHA-256)": "ab" * 32, "Report by abbe": "0.1.0"},
     days=("2026-11-22", "2026-11-23"),
-    issuer=Issuer("Plant 2, metrology", "Bonn", "DE", "A. Bär"),
+    issuer=Issuer(laboratory="Plant 2, metrology", city="Bonn", country="DE", person="A. Bär"),
 )
 
 

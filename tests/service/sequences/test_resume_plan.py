@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 from math import ceil, dist
 
@@ -74,7 +75,9 @@ def test_of_a_path_that_hardly_began_nothing_is_known():
 
 def so_far(good_mm: float, counted_from_mm: float = 0.0) -> ReadProgress:
     at = np.arange(counted_from_mm, good_mm, FEED_MM_S / 200.0)
-    return ReadProgress((RunPiece(4, good_mm),), counted_from_mm, at, np.sin(at / 20.0) * 0.01, 5)
+    return ReadProgress(
+        pieces=(RunPiece(4, good_mm),), counted_from_mm=counted_from_mm, arc_mm=at, deviation_mm=np.sin(at / 20.0) * 0.01, boot_id=5
+    )
 
 
 @settings(deadline=None)
@@ -87,8 +90,8 @@ def test_the_pieces_and_the_rest_are_the_whole_path_once(shares, leads):
     remainder, rest = None, step
     for share in shares:
         good = counted_mm + share * (float(ARC[-1]) - counted_mm)
-        before = so_far(good, counted_mm)
-        found = rest_of_path(step, ReadProgress((*pieces, RunPiece(len(pieces), good)), counted_mm, before.arc_mm, before.deviation_mm, 5))
+        pieces_read = (*pieces, RunPiece(len(pieces), good))
+        found = rest_of_path(step, replace(so_far(good, counted_mm), pieces=pieces_read))
         if found is None:
             # only where there is no room for lead and stretch, before what counts already or before the end
             assert min(good, ends_mm) < max(counted_mm, 0.5 * FEED_MM_S) + 0.5 * FEED_MM_S + 3.0
@@ -147,7 +150,9 @@ def test_a_steep_stretch_is_no_knock():
     """Either beginning is known to half a period: at 6000 mm/min and 50 Hz that is 2 mm of path."""
     slope = 0.002
     at = np.arange(0.0, 60.0, 0.1)
-    remainder = PathRemainder((RunPiece(1, 100.0),), 0.0, 500.0, 100.0, at, slope * at, 5)
+    remainder = PathRemainder(
+        pieces=(RunPiece(1, 100.0),), offset_mm=0.0, whole_mm=500.0, feed_mm_s=100.0, arc_mm=at, deviation_mm=slope * at, boot_id=5
+    )
     for shift in (-0.5, 0.0, 0.5):
         compare = StretchComparison(remainder, 50)
         compare.add(BarSample(0, 0, 0, 0))
@@ -179,7 +184,7 @@ def test_on_a_circle_whose_places_are_passed_twice_it_goes_back_a_lead_and_a_str
     good = share * float(arc[-1])
     at = np.arange(0.0, good, FEED_MM_S / 200.0)
     mounted = next(k for k, s in enumerate(circle.steps) if isinstance(s, MountBar))
-    known = ReadProgress((RunPiece(1, good),), 0.0, at, 0.0 * at, 5)
+    known = ReadProgress(pieces=(RunPiece(1, good),), counted_from_mm=0.0, arc_mm=at, deviation_mm=0.0 * at, boot_id=5)
     _, _, resume_trail, remainder = rest_of(circle, mounted, (), None, known)
     assert remainder is not None
     stands = [float(np.interp(good + 7.0, arc, np.array(step.points_mm)[:, a])) for a in range(3)]
