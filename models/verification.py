@@ -1,4 +1,4 @@
-"""Figures of a verification run, each with its standard uncertainty: body-diagonal range, helix rms."""
+"""Figures of a verification run, each with its standard uncertainty: body-diagonal range, helix rms, rms of an artefact in a pose."""
 
 from __future__ import annotations
 
@@ -6,8 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from abbe.models.arrays import F1
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
+from abbe.models.solvers.observe import LOST, predict, run_jacobian
 from abbe.models.solvers.priors import U_WAVELENGTH
 
 U_REPEAT_MM = 1e-4
@@ -60,3 +62,34 @@ def helix_figure(run: RunData) -> VerificationFigure:
     second = left[2:] - 2 * left[1:-1] + left[:-2]
     noise = float(np.median(np.abs(second)) * 1.4826 / np.sqrt(6.0))
     return VerificationFigure(rms, float(np.hypot(noise / np.sqrt(len(left)), U_REPEAT_MM)), np.arange(len(left), dtype=np.float64), left)
+
+
+def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = False) -> VerificationFigure:
+    """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
+
+    ``with_machine``: what the solution of the machine leaves, too, in place of the whole deviation. Without a calibrated length the common
+    scale is fitted, too. The uncertainty combines that of the form with the noise of a reading.
+    """
+    p = run.points
+    assert p is not None
+    n_machine, theta = len(known.terms) + LOST, known.estimate.theta.copy()
+    if not with_machine:
+        theta[:n_machine] = 0.0
+    turned = np.stack([np.cross(axis, p.nominal_mm) for axis in np.eye(3)], axis=2)
+    rows = np.arange(len(p.component))
+    free = [p.matrix.T[p.component], turned[rows, p.component] / p.reach_mm]
+    free += [] if p.calibrated else [(p.nominal_mm - p.middle_mm)[rows, p.component][:, None] / p.reach_mm]
+    basis, size, _ = np.linalg.svd(np.concatenate(free, axis=1), full_matrices=False)
+    basis = basis[:, size > 1e-9 * size[0]]
+
+    def without_pose(v: F2) -> F2:
+        return np.asarray(v - basis @ (basis.T @ v))
+
+    y = run.deviation_mm - predict(known.machine, known.terms, run, known.setup, theta)
+    left = without_pose(y[:, None])[:, 0]
+    slope = without_pose(run_jacobian(known.machine, known.terms, run, known.setup, theta)[:, n_machine:])
+    along = left @ slope
+    noise = known.noise_mm["artefact"] ** 2 * float(left @ left)
+    rms = float(np.sqrt(np.mean(left**2)))
+    u = np.sqrt(float(along @ known.estimate.covariance[n_machine:, n_machine:] @ along) + noise) / (len(left) * rms)
+    return VerificationFigure(rms, float(u), np.arange(len(left), dtype=np.float64), left)

@@ -118,6 +118,7 @@ def _truth(argv: Sequence[str]) -> int:
     parser.add_argument("--bank", type=Path, help="compensation image (docs/protocols/cnc.md), big-endian words (default: no correction)")
     parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
     parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
+    parser.add_argument("--plane", type=float, nargs=5, metavar=("X0", "X1", "Y0", "Y1", "Z"), help="add the rms in this plane, mm")
     options = parser.parse_args(argv)
     scenario = _scenario(options)
     if options.seed is not None:
@@ -126,7 +127,7 @@ def _truth(argv: Sequence[str]) -> int:
     if options.nodes < 2:
         parser.error("--nodes must be at least 2")
     image = None if options.bank is None else options.bank.read_bytes()
-    sys.stdout.write(json.dumps(truth(scenario, image, options.nodes, arrows=options.arrows)) + "\n")
+    sys.stdout.write(json.dumps(truth(scenario, image, options.nodes, arrows=options.arrows, plane=options.plane)) + "\n")
     return 0
 
 

@@ -108,9 +108,9 @@ class ArtefactConfig:
     """The plate that the fixture can put on the table. ``kind``: ``hole_plate`` or ``ball_plate``; sizes of the random draws beside."""
 
     kind: str = "hole_plate"
-    columns: int = 5
-    rows: int = 5
-    pitch_mm: float = 45.0
+    columns: int = 4
+    rows: int = 4
+    pitch_mm: float = 75.0
     radius_mm: float = 10.0
     form_um: float = 15.0
     expansion_ppm: float = 11.5

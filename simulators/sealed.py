@@ -110,14 +110,33 @@ def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool
     return figures
 
 
-def truth(scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False) -> dict[str, object]:
-    """Return the true errors of a scenario's machine; ``image`` is a compensation image as big-endian bytes, None for no correction."""
+def plane_rms_um(machine: Machine, correction: Correction, box_mm: list[float]) -> float:
+    """Return the rms deviation in a plane of X and Y, µm, rigid motion in it removed. ``box_mm``: lowest and highest X, same of Y, Z."""
+    x0, x1, y0, y1, z = box_mm
+    axes = np.meshgrid(np.linspace(x0, x1, FINE_NODES), np.linspace(y0, y1, FINE_NODES), indexing="ij")
+    points = np.stack([*axes, np.full(axes[0].shape, z)], axis=-1).reshape(-1, 3)
+    flat = deviation(machine, points, correction) * [1.0, 1.0, 0.0]
+    arm = points - points.mean(axis=0)
+    turn = np.stack([-arm[:, 1], arm[:, 0]], axis=1)
+    own = flat[:, :2] - flat[:, :2].mean(axis=0)
+    rest = own - turn * (np.sum(turn * own) / np.sum(turn * turn))
+    return 1000.0 * rms_norm(rest)
+
+
+def truth(
+    scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False, plane: list[float] | None = None
+) -> dict[str, object]:
+    """Return the true errors of a scenario's machine; ``image`` is a compensation image as big-endian bytes, None for no correction.
+
+    ``plane``: adds `plane_rms_um` of this box.
+    """
     draws = draw_machine(scenario)
     machine = Machine(Geometry(scenario.machine), draws)
     secret = live_of(scenario.hidden, machine.geometry.low_mm, machine.geometry.high_mm)
     hidden: dict[str, object] = {} if secret is None else {"hidden": secret.describe()}
     correction = no_correction if image is None else _correction(image)
-    return {**report(machine, correction, nodes, arrows=arrows), **describe(draws), **hidden}
+    flat: dict[str, object] = {} if plane is None else {"plane_rms_um": plane_rms_um(machine, correction, plane)}
+    return {**report(machine, correction, nodes, arrows=arrows), **describe(draws), **hidden, **flat}
 
 
 def _correction(image: bytes) -> bank.Correction:

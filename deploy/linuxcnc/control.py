@@ -36,6 +36,11 @@ class Snapshot:
     position_mm: tuple[float, float, float]
     line: int
     queue: int
+    probe_ready: bool
+    deflected: bool
+    tripped: bool
+    probed_mm: tuple[float, float, float]
+    """Commanded position at which the probe tripped in the last probing move, if it did (``tripped``)."""
 
 
 class Control:
@@ -91,6 +96,10 @@ class Control:
             position_mm=tuple(float(self._get(f"joint.{n}.pos-cmd")) for n in range(JOINTS)),
             line=int(s.motion_line),
             queue=int(s.queue),
+            probe_ready=bool(self._get("abbe-probe-ready")),
+            deflected=bool(self._get("motion.probe-input")),
+            tripped=bool(s.probe_tripped),
+            probed_mm=tuple(float(v) for v in s.probed_position[:JOINTS]),
         )
 
     def complaints(self) -> list[str]:
@@ -107,6 +116,12 @@ class Control:
         self._mode(linuxcnc.MODE_MDI)
         self._command.mdi(line)
         self._sent = self._command.serial
+
+    def work_offset_mm(self) -> tuple[float, float, float] | None:
+        """Zero of the active work coordinates, to which G38 refers; None if they are turned."""
+        self._poll()
+        s = self._status
+        return None if s.rotation_xy else tuple(float(s.g5x_offset[n] + s.g92_offset[n]) for n in range(JOINTS))
 
     def run(self, program: Path) -> None:
         """Execute a program from its first line."""

@@ -28,6 +28,7 @@ class Result(IntEnum):
     STROKE_LIMIT = 3
     FIFO_FULL = 4
     BUSY = 5
+    NO_PROBE = 6
 
 
 class Hold(IntEnum):
@@ -44,6 +45,7 @@ class _Pending:
     is_path: bool
     points: int
     aborted: bool = False
+    is_touch: bool = False
 
 
 class Motion:
@@ -67,6 +69,8 @@ class Motion:
         self.done = 0
         """Motions finished since the start."""
         self.path_start_us = self.path_end_us = self.in_position_us = 0
+        self.latch: tuple[Point, int] | None = None
+        """Where and when the probe tripped in the last touch; None: it did not."""
         self.fifo: list[Point] = []
         self._pending: _Pending | None = None
         self._path_points = 0
@@ -136,7 +140,9 @@ class Motion:
             self.in_position_us = self._now_us()
         if self.state.ready:
             self._path_points = self._pending.points if arrived and self._pending.is_path else self._path_points
-            self._end(counts=arrived or self._pending.aborted)
+            if self._pending.is_touch and self.state.tripped and not self._pending.aborted:
+                self.latch = self.state.probed_mm, self._now_us()
+            self._end(counts=arrived or self._pending.aborted or self.latch is not None)
 
     def _end(self, *, counts: bool) -> None:
         self.in_position_us = self.in_position_us or self._now_us()
@@ -155,6 +161,19 @@ class Motion:
             return refusal
         self._begin(_Pending(target_mm, is_path=False, points=0))
         self._control.mdi(f"{_MODES} G61 {_line(target_mm)} F{feed_mm_min:.2f}")
+        return Result.OK
+
+    def touch(self, target_mm: Point, feed_mm_min: float) -> Result:
+        """Go straight to a target until the probe trips (G38.3: without a contact it is reached, and nothing is wrong)."""
+        refusal = self._refusal(feed_mm_min) or self._strokes([target_mm])
+        if refusal or not self.state.probe_ready or self.state.deflected:
+            return refusal or Result.NO_PROBE
+        zero = self._control.work_offset_mm()
+        if zero is None:
+            return Result.BAD_ARGUMENT
+        self._begin(_Pending(target_mm, is_path=False, points=0, is_touch=True))
+        x, y, z = (t - o for t, o in zip(target_mm, zero, strict=True))
+        self._control.mdi(f"{_MODES} G61 G38.3 X{x:.5f} Y{y:.5f} Z{z:.5f} F{feed_mm_min:.2f}")
         return Result.OK
 
     def path_clear(self) -> Result:
@@ -214,7 +233,7 @@ class Motion:
 
     def _begin(self, pending: _Pending) -> None:
         self._control.complaints()
-        self.in_position_us = 0
+        self.in_position_us, self.latch = 0, None
         self._pending = pending
 
     def _refusal(self, feed_mm_min: float) -> Result:

@@ -56,6 +56,8 @@ class RegisterMap:
         self._motion, self._banks, self._clock, self._boot_id = motion, banks, clock, boot_id
         self._ack, self._result, self._done = 0, Result.OK, 0
         self._waits: tuple[int, int] | None = None  # number of the motion under way, count of finished motions that ends it
+        self._touch: int | None = None
+        self._latch = (0, 0, 0, 0, 0)
         self._fifo_ack, self._fifo_result = 0, Result.OK
         self._comp_ack, self._comp_result = 0, CompResult.OK
         self._motion_words, self._comp_words = [0] * _MOTION_WORDS, [0] * _COMP_WORDS
@@ -86,7 +88,15 @@ class RegisterMap:
         head = _words(">QIHHHH", self._clock.microseconds(), self._bits(), motion.alarm, self._ack, self._result, self._done_number())
         where = _words(">3iHI", *(round(p / _UNIT_MM) for p in motion.state.position_mm), motion.fifo_free, motion.points_done)
         times = _words(">QQHQ", motion.path_start_us, motion.path_end_us, motion.state.override_percent, motion.in_position_us)
-        return identity + head + where + times + _words(">HH28x", self._fifo_ack, self._fifo_result)
+        return identity + head + where + times + _words(">HH", self._fifo_ack, self._fifo_result) + self._probe()
+
+    def _probe(self) -> list[int]:
+        state = self._motion.state
+        if self._touch is not None and self._done_number() == self._touch and self._motion.latch is not None:
+            position_mm, at_us = self._motion.latch
+            self._latch = (*(round(p / _UNIT_MM) for p in position_mm), at_us, self._touch)
+            self._touch = None
+        return _words(">H3iQH4x", state.probe_ready | state.deflected << 1, *self._latch)
 
     def _bits(self) -> int:
         motion, state = self._motion, self._motion.state
@@ -144,7 +154,8 @@ class RegisterMap:
         if number != (self._ack + 1) & _U16:
             return
         self._motion.tick()
-        self._done_number()  # an earlier motion that has ended meanwhile must not be lost under this number
+        self._probe()  # an earlier motion that has ended meanwhile, and its latch, must not be lost under this number
+        self._done_number()
         before, feed_mm_min = self._motion.done, feed * _FEED_UNIT
         result = Result.BAD_ARGUMENT
         if command == 1:
@@ -155,8 +166,11 @@ class RegisterMap:
             result = self._motion.path_start(feed_mm_min)
         elif command == 4:
             result = self._motion.reset_alarm()
+        elif command == 5:
+            result = self._motion.touch((x * _UNIT_MM, y * _UNIT_MM, z * _UNIT_MM), feed_mm_min)
+        self._touch = number if command == 5 and result == Result.OK else None
         self._ack, self._result = number, result
-        if result == Result.OK and command in (1, 3):
+        if result == Result.OK and command in (1, 3, 5):
             self._waits = (number, before + 1)
         elif result == Result.OK:
             self._done, self._waits = number, None

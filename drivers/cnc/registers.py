@@ -95,7 +95,7 @@ MOTION_RESULT = {
     3: "target beyond the strokes",
     4: "FIFO full",
     5: "busy moving",
-    6: "no touch probe is fitted",
+    6: "no touch probe is fitted, or its stylus is deflected",
 }
 COMP_RESULT = {
     1: "bad argument",

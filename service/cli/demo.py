@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 DEFAULT_FOLDER = "abbe-demo"
 
 
-def demo(
+def demo(  # noqa: PLR0913 - one argument for each option
     seed: Annotated[int, typer.Option(help="Which simulated machine.")] = 1,
     speed: Annotated[float, typer.Option(min=1.0, max=200.0, help="Machine seconds per wall second.")] = 60.0,
     as_json: JsonOption = False,
@@ -32,6 +32,9 @@ def demo(
             "--hidden", metavar="SEED", min=0, help="Find the hidden effect of this machine, if there is one.", show_default=False
         ),
     ] = None,
+    artefact: Annotated[
+        bool, typer.Option("--artefact", help="Measure and correct with the machine's own touch probe and a plate that nobody calibrated.")
+    ] = False,
     serve: Annotated[bool, typer.Option("--serve", help="Let the service watch the machine, with its page, until Ctrl-C.")] = False,
     port: Annotated[int, typer.Option(help="Port of the page, with --serve; another one if it is taken.", min=0, max=65535)] = 8080,
 ) -> None:
@@ -39,8 +42,11 @@ def demo(
 
     With --serve: the service checks the machine by a timetable; the machine drifts, an alarm reports it, and a proposal waits in the page
     for a person; after approval the service pushes and verifies it. With --hidden: find the physical effect that the model of the
-    machine lacks, prove it on a new measurement, and reveal the truth.
+    machine lacks, prove it on a new measurement, and reveal the truth. With --artefact: no ball-bar and no laser measure, but the probe.
     """
+    if artefact:
+        artefact_demo(seed, speed, as_json, keep)
+        return
     if hidden is not None:
         hidden_demo(hidden, speed, as_json, keep)
         return
@@ -94,6 +100,28 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
             typer.echo(line)
     Console(stderr=True).print(f"report: {report}")
     conclude("abbe demo --hidden 4" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
+
+
+def artefact_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:
+    """Measure a plate in several poses, correct its plane, and verify in another pose."""
+    from rich.console import Console
+
+    from abbe.service.cli.running import display, run_job
+    from abbe.service.demo.demo_artefact import artefact_json, artefact_report, run_artefact_demo, summary_lines
+    from abbe.service.rendering.document_page import write_document
+
+    folder = _folder(keep)
+    with display() as sink, work_folder(folder, keep) as work:
+        result = run_job(run_artefact_demo(seed, speed, work, sink))
+    report = folder / "artefact.html"
+    write_document(artefact_report(result), report)
+    if as_json:
+        print_json(artefact_json(result))
+    else:
+        for line in summary_lines(result):
+            typer.echo(line)
+    Console(stderr=True).print(f"report: {report}")
+    conclude("abbe demo" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
 
 
 def _folder(keep: Path | None) -> Path:

@@ -12,6 +12,8 @@ import numpy as np
 
 from abbe.models.compensation.sign_probe import expected_changes, probe
 from abbe.models.compensation.tables import NineTables, Predicted
+from abbe.models.verification import pose_figure
+from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.compensation.gate import Admission, PushContext, PushPrecheck, admit, check_preconditions, check_promise
@@ -21,7 +23,6 @@ from abbe.service.compensation.proposals import (
     check_same_table,
     check_temperature,
     gather,
-    load_runs,
     make,
     solve_again,
 )
@@ -34,10 +35,18 @@ from abbe.service.identification.solve import Solved, helix_misfit
 from abbe.service.identification.table_removal import removed_table, subtract_table
 from abbe.service.push.operations import VerificationResult
 from abbe.service.push.validate import drift_reason
+from abbe.service.runs.observations import run_data
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Suspending
-from abbe.service.sequences.recipes.campaigns import verification
-from abbe.service.verification.verify import VerificationDecision, VerificationFigures, check_before, decide, figure_rows, figures
+from abbe.service.verification.verify import (
+    VerificationDecision,
+    VerificationFigures,
+    check_before,
+    decide,
+    figure_rows,
+    figures,
+    pose_figures,
+)
 
 NO_NEWER_RUN = "DRIFT: no newer ball-bar run, outside the solution, shows whether the machine has changed since"
 VERIFY, SIGN = "verify-after-push-", "sign-check"
@@ -93,7 +102,8 @@ async def correct(context: PushContext, campaign: str | int, before: list[Run], 
     gathered = await gather(context.session.controller, store, site, campaign)
     check_same_table(gathered.base, before)
     check_temperature(site, gathered.runs)
-    figures(before)  # before anything is written: runs that are not a verification are refused now
+    if context.poses is None:
+        figures(before)  # before anything is written: runs that are not a verification are refused now
     made = await make(store, site, gathered, progress=context.progress, agree=lambda promised: check_promise(promised, site.limits))
     return await _push(context, await admit(context, made.number, control), made, before)
 
@@ -128,17 +138,16 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
     evidence = proposed.candidate.evidence
     newest_s = evidence.ended_s if evidence.last_s is None else evidence.last_s
     check_before_runs(site, precheck.base, before, newest_s, context.clock.utc().timestamp())
-    old = figures(before)
+    old = _figures(context, made.solved, before)
     check_before(old)
-    helix = next((r for r in before if r.test == "ballbar_helix"), None)
-    misfit_mm = None if helix is None else helix_misfit(made.solved, _as_other_runs(helix, made.solved, precheck.base.tables))
+    misfit_mm = _misfit_mm(made.solved, before, precheck.base.tables)
     bar = None
-    if session.ballbar is not None and session.fixture is not None:
+    if context.poses is None and session.ballbar is not None and session.fixture is not None:
         number = sum(c.name.startswith(SIGN) for c in await asyncio.to_thread(store.campaigns.all)) + 1
         bar = BarPlaces(session, store, site, context.progress, f"{SIGN} {number}", PLACES, context.control)
     p, lsb_nm = proposed.predicted, proposed.candidate.lsb_nm
     doc = {"kind": "nine one-axis tables", "predicted_rms_um": p.after_mm * 1e3, "u_model_um": p.u_model_mm * 1e3, "proposal": made.number}
-    work = _PushQuestions(context, admission, misfit_mm, bar, old)
+    work = _PushQuestions(context, admission, misfit_mm, bar, old, made.solved)
     wanted = WantedTable(proposed.tables, precheck.base, lsb_nm, proposed.solution_id, doc, proposed.image_id)
     pushed, after, decision = await _push_and_verify(work, wanted)
     bank = pushed.bank if decision.keep else pushed.previous_bank
@@ -147,6 +156,19 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
     return Correction(
         made.solved, proposed.tables, lsb_nm, p, misfit_um, old, after, pushed, decision, bank, image, proposed.not_for_tables, made.number
     )
+
+
+def _figures(context: PushContext, solved: Solved, runs: list[Run]) -> VerificationFigures:
+    return figures(runs) if context.poses is None else pose_figures(runs, solved.joint)
+
+
+def _misfit_mm(solved: Solved, before: list[Run], table: NineTables | None) -> float | None:
+    """Return the rms residual of the solution in a newer helix or pose; None without either."""
+    helix = next((r for r in before if r.test == "ballbar_helix"), None)
+    if helix is not None:
+        return helix_misfit(solved, _as_other_runs(helix, solved, table))
+    poses = [pose_figure(run_data(r), solved.joint, with_machine=True).value_mm for r in before if r.is_artefact]
+    return max(poses, default=None)
 
 
 def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
@@ -167,6 +189,7 @@ class _PushQuestions:
     """Rms residual of the solution in a newer run, which the solution did not use, mm; None without such a run."""
     bar: BarPlaces | None
     before: VerificationFigures
+    solved: Solved
     read_before: PlaceReadings | None = None
     after: VerificationFigures | None = None
     decision: VerificationDecision | None = None
@@ -192,7 +215,7 @@ class _PushQuestions:
     async def probe(self) -> VerificationResult:
         """Probe sign, axis and unit of this table physically; then clear the bar away: the verification mounts its own."""
         if self.bar is None or self.read_before is None:
-            return VerificationResult(True, "no ball-bar is configured: the sign rests on the commissioning")
+            return VerificationResult(True, "no ball-bar reads this table: the sign rests on the commissioning")
         after = await self.bar.read("after")
         await self.bar.clear_away()
         each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.precheck.base.tables, self.precheck.proposed.tables)
@@ -203,10 +226,10 @@ class _PushQuestions:
         context = self.context
         number = sum(c.name.startswith(VERIFY) for c in await asyncio.to_thread(context.store.campaigns.all)) + 1
         name = f"{VERIFY}{number}"
-        plan = paced(verification(context.site.machine, rate_hz=context.rate_hz, name=name), context.site.max_feed_mm_min)
+        plan = paced(context.verification(name), context.site.max_feed_mm_min)
         options = MeasureOptions(control=context.control, part=True)
-        ids = await measure(context.session, context.store, context.site, plan, progress=context.progress, options=options)
-        self.after = figures(await load_runs(context.store, ids))
+        await measure(context.session, context.store, context.site, plan, progress=context.progress, options=options)
+        self.after = _figures(context, self.solved, (await asyncio.to_thread(from_store, context.store, name)).runs)
         self.decision = decide(self.before, self.after, self.pushing.crc if self.pushing is not None else None)
         self.verified_as = name
         return VerificationResult(self.decision.keep, self.decision.text)

@@ -33,6 +33,7 @@ from abbe.service.push.operations import Approval
 from abbe.service.push.validate import Candidate, CandidateContext, EvidenceSeal, content_digest, promise_reason, reasons_against
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import verification
+from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base
@@ -150,7 +151,8 @@ class PushContext:
 
     ``rate_hz``: readings of the ball-bar per second in verifications. ``attended``: a person orders the push; otherwise the limits of
     unattended pushes hold as well, and an approval is always needed. ``control``: stops or pauses the push; while an unverified table is in
-    force the push cannot be paused, and a stop rolls the table back.
+    force the push cannot be paused, and a stop rolls the table back. ``poses``: poses of an artefact that verify a table made of artefacts,
+    in place of diagonals and a helix.
     """
 
     session: Session
@@ -161,6 +163,13 @@ class PushContext:
     rate_hz: int = 100
     attended: bool = True
     control: Control = field(default_factory=Control)
+    poses: CampaignPlan | None = None
+
+    def verification(self, name: str) -> CampaignPlan:
+        """Return the tests that are measured before and after a push."""
+        if self.poses is None:
+            return verification(self.site.machine, rate_hz=self.rate_hz, name=name)
+        return replace(self.poses, name=name)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +238,7 @@ async def _check_control(context: PushContext) -> tuple[LevelStatus, list[TableR
     session, store, site = context.session, context.store, context.site
     if not session.recovered:
         await recover(session.controller, store, site)
-    await check_devices(session, verification(site.machine, rate_hz=context.rate_hz), air=site.watching.air_c is not None)
+    await check_devices(session, context.verification("verify"), air=site.watching.air_c is not None)
     level, refused = LevelStatus(Capabilities(), ""), []
     try:
         await check_commissioned(session.controller, store, site)

@@ -20,6 +20,8 @@ import numpy as np
 
 from abbe.drivers.api import TableController, TableFormat
 from abbe.drivers.tables import FORMAT_VERSION
+from abbe.models.arrays import F2
+from abbe.models.compensation.plane import plane_tables
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.scales import SCALE_TEXTS
@@ -30,6 +32,7 @@ from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts, touched_box_mm, unsensed_axis
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
 from abbe.service.identification.solve_report import assess, solution_doc
@@ -266,10 +269,10 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
     Raises
     ------
     TableRefused
-        The readings cannot carry the map, or (``without_scale``) the scales are not what they know worst.
+        The readings cannot carry the map, artefacts span a volume, or (``without_scale``) the scales are not what they know worst.
     """
     solved = solve_runs(site, runs)
-    if beyond := beyond_the_prior(solved.joint):
+    if not only_artefacts(solved.joint) and (beyond := beyond_the_prior(solved.joint)):
         raise TableRefused(f"no tables from a map that the readings cannot carry: {beyond.what}", f"{beyond.remedy}; nothing was written")
     change, predicted, left_out = change_of(solved, without_scale=without_scale)
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted, left_out)
@@ -277,6 +280,8 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
 
 def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTables, Predicted, tuple[str, ...]]:
     """Return what a solution adds to the tables in force, the prediction, and what is left out, in words; as for `propose`."""
+    if only_artefacts(solved.joint):
+        return _change_in_plane(solved)
     if not without_scale:
         change = nine_tables(solved.joint, GRID)
         return change, predict_residual(solved.joint, change), ()
@@ -284,6 +289,28 @@ def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTable
     sources, text = free.sources, SCALE_TEXTS[free.left_out or "common"]
     change = nine_tables(sources.solution, GRID, sources=sources)
     return change, predict_residual(sources.solution, change, sources=sources), (f"{text}, which the runs hardly tell: left out",)
+
+
+def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, ...]]:
+    """Return tables of the plane in which artefacts lay; they do not act beyond the touched positions.
+
+    Raises
+    ------
+    TableRefused
+        The solution has a fault that nobody looked at, or all three directions were sensed.
+    """
+    joint = solved.joint
+    if unsensed_axis(joint) is None:
+        raise TableRefused("these artefacts span a volume: one-axis tables are made of one plane", "make a grid: abbe solve --tables")
+    frame: list[str] = []
+
+    def known(points: F2) -> tuple[F2, F2]:
+        value, expanded, words = deviation_of_artefacts(joint, points)
+        frame.append(words)
+        return value, 0.5 * expanded
+
+    change, predicted = plane_tables(joint.machine, touched_box_mm(joint), known, GRID)
+    return change, predicted, (f"in the plane and part of the strokes where the artefact lay only; {frame[0]}",)
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:

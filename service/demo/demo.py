@@ -31,7 +31,7 @@ from abbe.service.storage.store import Store
 MAX_SAMPLES_PER_S = 6000
 """Largest number of ball-bar samples per wall-clock second, so that a small PC keeps up at high speed."""
 
-CERTIFICATES = {"ballbar": date(2099, 12, 31), "laser": date(2099, 12, 31)}
+CERTIFICATES = {kind: date(2099, 12, 31) for kind in ("ballbar", "laser", "artefact")}
 """Last days of the certificates: far away, since simulated instruments need no calibration."""
 FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Wide limits: the first table of an uncorrected machine changes every correction from zero to its full value."""

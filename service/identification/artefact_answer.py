@@ -73,6 +73,15 @@ def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2,
     return deviation, expanded, MOTION.format(plane=plane[0], scale=scale[0]) + scale[1] + plane[1]
 
 
+def touched_box_mm(joint: JointSolution) -> F2:
+    """Return the lowest and highest position of each axis over all points, mm, shape (3, 2); an axis whose direction is unsensed stands."""
+    places = np.concatenate([run.axes_mm for run in joint.data if run.points is not None and run.points.source != "length"])
+    box, axis = np.stack([places.min(axis=0), places.max(axis=0)], axis=1), unsensed_axis(joint)
+    if axis is not None:
+        box[axis] = places[:, axis].mean()
+    return box
+
+
 def _offered(value_mm: F2, u_mm: F2) -> float:
     """Return the share of a map that is offered: all of it if it is clearly larger than its uncertainty, nothing if it is smaller.
 

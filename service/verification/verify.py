@@ -8,8 +8,9 @@ from typing import Literal
 
 import numpy as np
 
-from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure
-from abbe.service.domain.run import Run
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure
+from abbe.service.domain.run import ArtefactSetup, Run
 from abbe.service.errors import MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
 from abbe.service.runs.observations import run_data
@@ -29,7 +30,7 @@ Verdict = Literal["pass", "fail", "cannot tell"]
 
 @dataclass(frozen=True)
 class VerificationFigures:
-    """Figures of one verification: body diagonals by name, and the helix.
+    """Figures of one verification: body diagonals by name, and the helix; or an artefact's poses in place of diagonals (``of``).
 
     ``air_c``: lowest and highest air temperature, None without any reading. ``tables``: CRC of every table that was active during its runs;
     None stands for a run that does not record it.
@@ -39,6 +40,7 @@ class VerificationFigures:
     helix: VerificationFigure | None
     air_c: tuple[float, float] | None = None
     tables: frozenset[int | None] = frozenset()
+    of: Literal["body diagonal", "pose"] = "body diagonal"
 
     @property
     def finite(self) -> bool:
@@ -48,7 +50,7 @@ class VerificationFigures:
 
     @property
     def worst(self) -> VerificationFigure:
-        """The body diagonal with the largest range."""
+        """The body diagonal with the largest range, or the worst pose."""
         return max(self.diagonals.values(), key=lambda f: f.value_mm)
 
 
@@ -77,6 +79,25 @@ def figures(runs: list[Run]) -> VerificationFigures:
             f"these runs are not a verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
     return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.table.crc for run in runs))
+
+
+def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
+    """Figures of artefacts in poses that the solution ``known``, which knows their form, did not use.
+
+    Raises
+    ------
+    MeasurementFault
+        A run is not one of an artefact of this solution, or is not judged.
+    """
+    poses = {}
+    for run in runs:
+        check_judged(run)
+        if not isinstance(run.setup, ArtefactSetup) or f"form_{run.setup.artefact}_" not in " ".join(known.estimate.names):
+            raise MeasurementFault(
+                f"run {run.run_id} is not of an artefact whose form is known", "measure the same artefact in another pose"
+            )
+        poses[run.run_id] = pose_figure(run_data(run), known)
+    return VerificationFigures(poses, None, _air_c(runs), frozenset(run.table.crc for run in runs), "pose")
 
 
 def _air_c(runs: list[Run]) -> tuple[float, float] | None:
@@ -140,12 +161,15 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
         return VerificationDecision(False, f"cannot tell whether it is better: {why}")
     worst = before.worst.value_mm
     gain, needed = worst - after.worst.value_mm, _expanded(before.worst, after.worst)
-    change = f"worst body diagonal {worst * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm"
+    change = f"worst {before.of} {worst * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm"
     if gain <= needed:
         return VerificationDecision(False, f"{change}: no improvement beyond its uncertainty of {needed * 1e3:.1f} µm")
     if (before.helix is None) != (after.helix is None):
         return VerificationDecision(False, f"{change}, but the helix was measured only once: the rest cannot be judged")
-    pairs = [(f"diagonal {k}", before.diagonals[k], after.diagonals[k], worst) for k in sorted(DIAGONALS)]
+    if before.diagonals.keys() != after.diagonals.keys():
+        return VerificationDecision(False, f"{change}, but the two verifications do not have the same runs")
+    kind = before.of.removeprefix("body ")
+    pairs = [(f"{kind} {k}", before.diagonals[k], after.diagonals[k], worst) for k in sorted(before.diagonals)]
     if before.helix is not None and after.helix is not None:
         pairs.append(("helix", before.helix, after.helix, before.helix.value_mm))
     for name, old, new, scale in pairs:
@@ -154,7 +178,9 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
             return VerificationDecision(False, f"{change}, but cannot tell whether nothing got worse: {blind}")
         worse = new.value_mm - old.value_mm
         if worse > _expanded(old, new) + WORSE_SHARE * scale:
-            return VerificationDecision(False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst diagonal improved")
+            return VerificationDecision(
+                False, f"{name} got worse by {worse * 1e3:.1f} µm, although the worst {before.of.removeprefix('body ')} improved"
+            )
     return VerificationDecision(True, f"{change} (U = {needed * 1e3:.1f} µm)")
 
 
@@ -175,8 +201,9 @@ def overall(verdicts: list[Verdict]) -> Verdict:
 
 def figure_rows(found: VerificationFigures) -> dict[str, tuple[float, float]]:
     """Figures as (value, standard uncertainty) in µm, by the names used in limits, JSON and reports."""
-    rows = {f"diagonal_{k}_um": (f.value_mm * 1e3, f.u_mm * 1e3) for k, f in found.diagonals.items()}
-    rows["body_diagonal_um"] = (found.worst.value_mm * 1e3, found.worst.u_mm * 1e3)
+    name = found.of.removeprefix("body ")
+    rows = {f"{name}_{k}_um": (f.value_mm * 1e3, f.u_mm * 1e3) for k, f in found.diagonals.items()}
+    rows["body_diagonal_um" if found.of == "body diagonal" else "worst_pose_um"] = (found.worst.value_mm * 1e3, found.worst.u_mm * 1e3)
     if found.helix is not None:
         rows["helix_rms_um"] = (found.helix.value_mm * 1e3, found.helix.u_mm * 1e3)
     return rows

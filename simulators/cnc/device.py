@@ -328,7 +328,7 @@ class Controller:
     def touch(self, target_mm: F, feed_mm_min: float) -> Result:
         """Go straight to a target until the probe trips; the axes then stop."""
         refusal = self._refuse(feed_mm_min, target_mm[None, :])
-        if refusal or not self.probe_fitted():
+        if refusal or not self.probe_fitted() or self.deflected():
             return refusal or Result.NO_PROBE
         start, felt = self.position_mm, self.feel(self.position_mm, target_mm, feed_mm_min)
         if felt.trip_mm is None:

@@ -38,7 +38,7 @@ PLATE = ArtefactObject.read(
     {
         "kind": "hole_plate",
         "features": [
-            {"id": f"{'ABC'[i]}{j + 1}", "nominal_mm": [45.0 * i, 45.0 * j, 0.0], "sensed": "xy", "radius_mm": 10.0}
+            {"id": f"{'ABC'[i]}{j + 1}", "nominal_mm": [75.0 * i, 75.0 * j, 0.0], "sensed": "xy", "radius_mm": 10.0}
             for j in range(2)
             for i in range(3)
         ],

@@ -96,7 +96,7 @@ async def test_every_feature_is_found_to_a_micrometre_and_the_first_one_again(pl
     columns[:, 2] = turn.reshape(-1)
     off = (deviation - form).reshape(-1)
     left = off - columns @ np.linalg.lstsq(columns, off, rcond=None)[0]
-    assert np.abs(left).max() < 0.008, "form and pose; the rest are the machine's errors over 90 x 45 mm"
+    assert np.abs(left).max() < 0.008, "form and pose; the rest are the machine's errors over 150 mm"
     assert (run_.columns.further["u_mm"] < 5e-4).all()
     assert np.isfinite(run_.columns.further["temperature_C"]).all()
 

@@ -61,7 +61,7 @@ class Instance:
                 await asyncio.sleep(0.05)
         self.seconds = time.monotonic() - begin
         self._drives = await asyncio.create_subprocess_exec(
-            *self._inside("/usr/bin/python3", "-c", DRIVES.read_text()), stdin=subprocess.PIPE, stdout=subprocess.PIPE
+            *self.inside("/usr/bin/python3", "-c", DRIVES.read_text()), stdin=subprocess.PIPE, stdout=subprocess.PIPE
         )
 
     def bridge_log(self) -> str:
@@ -99,7 +99,7 @@ class Instance:
 
     def halcmd(self, *words: str) -> None:
         """What somebody at the machine's switches would do."""
-        subprocess.run(self._inside("halcmd", "-s", *words), check=True)
+        subprocess.run(self.inside("halcmd", "-s", *words), check=True)
 
     def faster(self, velocity_mm_s: int, acceleration_mm_s2: int) -> None:
         """Let the next start have quicker axes than the configuration's."""
@@ -113,7 +113,7 @@ class Instance:
             await self._drives.communicate(b"")  # its input ends
             self._drives = None
         if self._process is not None and self._process.returncode is None:
-            await (await asyncio.create_subprocess_exec(*self._inside("pkill", "-TERM", "-f", "display.py"))).wait()
+            await (await asyncio.create_subprocess_exec(*self.inside("pkill", "-TERM", "-f", "display.py"))).wait()
             with suppress(TimeoutError):
                 async with asyncio.timeout(within(20)):
                     await self._process.wait()
@@ -135,7 +135,7 @@ class Instance:
         finally:
             shutil.rmtree(self.run, ignore_errors=True)
 
-    def _inside(self, *command: str) -> list[str]:
+    def inside(self, *command: str) -> list[str]:
         assert self._process is not None
         first = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text().split()[0]
         return ["nsenter", "-t", first, "-i", "-n", "-p", "-m", "env", f"HOME={self.run}", *command]

@@ -103,3 +103,12 @@ def test_command_names_a_missing_scenario(tmp_path) -> None:
     assert done.returncode == 2
     assert "none.toml" in done.stderr
     assert done.stderr.count("\n") == 1
+
+
+def test_a_plane_sees_neither_height_nor_rigid_motion(scenario) -> None:
+    m = machine(scenario(scale_sd_um_per_m=40.0))
+    box = [100.0, 400.0, 100.0, 400.0, 200.0]
+    before = figures.plane_rms_um(m, figures.no_correction, box)
+    assert before > 1.0
+    lifted = figures.plane_rms_um(m, lambda command: np.full_like(command, 0.02), box)
+    assert lifted == pytest.approx(before, abs=0.01)

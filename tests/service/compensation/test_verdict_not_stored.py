@@ -50,7 +50,7 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
                 return PushResult(1, 1, 1, 7, 0, 5, kept, "as decided", ())
 
         held = SimpleNamespace(by="anna", approval=lambda clock: None)
-        work = Work(cast("Any", bench), cast("Any", SimpleNamespace(precheck=held, level=3)), None, None, AFTER)
+        work = Work(cast("Any", bench), cast("Any", SimpleNamespace(precheck=held, level=3)), None, None, AFTER, cast("Any", None))
         monkeypatch.setattr(correct, "Pushing", Decided)
         await correct._push_and_verify(work, cast("Any", None))
         (stored,) = store.verifications.latest()

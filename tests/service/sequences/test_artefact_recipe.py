@@ -39,7 +39,7 @@ def test_steps_are_up_mount_touch_and_clear_away():
 
 def test_a_turned_plate_is_touched_where_it_lies_in_directions_of_the_machine():
     one, two, three = touches(replace(TEST, rotation_deg=(0.0, 0.0, 90.0)))[:3]
-    assert two.centre_mm == (250.0, 245.0, 194.0), "B1 lies along Y, 6 mm below the top"
+    assert two.centre_mm == (250.0, 275.0, 194.0), "B1 lies along Y, 6 mm below the top"
     assert one.sides[0] == (1.0, 0.0, 0.0)
     assert three.start_deg == 45.0
     assert three.sides[0] == pytest.approx((0.5**0.5, 0.5**0.5, 0.0))

@@ -83,7 +83,9 @@ def test_the_axes_stop_just_beyond_the_trip_and_a_new_touch_forgets_the_latch() 
     right = go(w, x + 12.0, y, z - 8.0, touch=True)
     assert 0.0 < w.controller.position_mm[0] - right[0] < 0.03
     assert w.controller.deflected()
-    assert go(w, x, y, z - 8.0, touch=True) is None
+    assert w.controller.touch(np.array([x, y, z - 8.0]), 100.0) == Result.NO_PROBE, "only a move frees the stylus"
+    go(w, x, y, z - 8.0)
+    assert w.controller.latch_mm is None
     assert not w.controller.deflected()
 
 
@@ -115,24 +117,24 @@ def test_without_a_plate_the_control_has_no_probe() -> None:
 
 def test_the_plate_turns_slips_and_grows() -> None:
     w = world(expansion_ppm=11.5)
-    before = centre(w, "E5")
+    before = centre(w, "D4")
     w.table.temperature_c += 2.0
-    grown = centre(w, "E5") - before
-    assert grown[:2] == pytest.approx([180.0 * 11.5e-6 * 2.0] * 2, rel=1e-3)
+    grown = centre(w, "D4") - before
+    assert grown[:2] == pytest.approx([225.0 * 11.5e-6 * 2.0] * 2, rel=1e-3)
     w.table.move(np.array([0.05, 0.0, 0.0]))
-    assert (centre(w, "E5") - before - grown)[0] == pytest.approx(0.05)
+    assert (centre(w, "D4") - before - grown)[0] == pytest.approx(0.05)
     w.table.quarters = 1
     w.table.mount(ORIGIN, np.eye(3), 0.0)
-    assert centre(w, "A1") == pytest.approx(before - [0.0, 180.0, 0.0], abs=1.0)
+    assert centre(w, "A1") == pytest.approx(before - [0.0, 225.0, 0.0], abs=1.0)
 
 
 def test_its_owner_knows_nominal_places_and_one_length() -> None:
     known = World(Scenario()).table.body.document(4e-4)
     body = World(Scenario()).table.body
     (length,) = known["calibrated_lengths"]
-    assert (length["from"], length["to"]) == ("A1", "E1")
-    assert abs(length["length_mm"] - 180.0) < 0.1
+    assert (length["from"], length["to"]) == ("A1", "D1")
+    assert abs(length["length_mm"] - 225.0) < 0.1
     assert length["length_mm"] == pytest.approx(
-        float(np.linalg.norm((body.nominal_mm + body.form_mm)[4] - (body.nominal_mm + body.form_mm)[0])), abs=1e-5
+        float(np.linalg.norm((body.nominal_mm + body.form_mm)[3] - (body.nominal_mm + body.form_mm)[0])), abs=1e-5
     )
     assert "form" not in str(known)
