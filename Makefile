@@ -10,12 +10,14 @@ RUN_READY := $(VENV)/.ready-run
 DEV_READY := $(VENV)/.ready-dev
 BENCH_VENV := .venv-bench
 BENCH_READY := $(BENCH_VENV)/.ready
+SITE_VENV := .venv-site
+SITE_READY := $(SITE_VENV)/.ready
 RELEASE_VENV := .venv-release
 RELEASE_READY := $(RELEASE_VENV)/.ready
 COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes --no-header --no-annotate
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test test-long lint fmt docs bench lock release clean
+.PHONY: help demo test test-long lint fmt docs site pictures bench lock release clean
 # Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
 WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
@@ -55,6 +57,13 @@ docs: $(DEV_READY) ## write the pages of docs/ that come from the code: commands
 	@$(BIN)/python -m abbe.service.web.catalogue > docs/reference/error-codes.md
 	@$(BIN)/abbe schema
 
+site: $(SITE_READY) ## README and docs/ as a site in build/site, with search, the notebooks run; it needs no server and no network
+	@OPENBLAS_NUM_THREADS=1 $(SITE_VENV)/bin/python -W ignore -m sphinx -q -W --keep-going -c docs $(ARGS) . build/site
+	@echo "build/site/index.html"
+
+pictures: $(DEV_READY) ## take the pictures of docs/pictures anew, from the screens of the tests and from a demonstration; needs Chromium
+	@ABBE_PICTURES=$(CURDIR)/docs/pictures OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/system/test_pictures.py
+
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
 	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py
 	@$(BENCH_VENV)/bin/python -m tests.experiments.bench $(ARGS)
@@ -64,13 +73,14 @@ lock: ## pin the dependencies of pyproject.toml anew (ARGS=--upgrade for newer v
 	$(COMPILE) $(ARGS) pyproject.toml -o requirements.lock
 	$(COMPILE) $(ARGS) --extra dev -c requirements.lock pyproject.toml -o requirements-dev.lock
 	$(COMPILE) $(ARGS) --extra bench -c requirements-dev.lock pyproject.toml -o requirements-bench.lock
+	$(COMPILE) $(ARGS) --extra site -c requirements.lock pyproject.toml -o requirements-site.lock
 	$(COMPILE) $(ARGS) --extra release -c requirements.lock pyproject.toml -o requirements-release.lock
 
 release: $(RELEASE_READY) ## source archive, wheel, bill of materials and wheelhouse in dist/, checked and tried without a network; a dry run
 	@deploy/release.sh $(ARGS)
 
 clean: ## remove caches and build products (.venv stays)
-	rm -rf $(BENCH_VENV) $(RELEASE_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf $(BENCH_VENV) $(RELEASE_VENV) $(SITE_VENV) build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find service drivers models simulators tests -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(BIN)/python:
@@ -98,6 +108,14 @@ $(BENCH_READY): requirements-bench.lock pyproject.toml | $(BIN)/python
 	@$(BIN)/python -m venv $(BENCH_VENV)
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-bench.lock
 	@$(BENCH_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
+	@touch $@
+
+# Sphinx runs the notebooks, so this environment holds Abbe as well.
+$(SITE_READY): requirements-site.lock pyproject.toml | $(BIN)/python
+	@echo "setting up $(SITE_VENV) from requirements-site.lock, about a minute"
+	@$(BIN)/python -m venv $(SITE_VENV)
+	@$(SITE_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --require-hashes -r requirements-site.lock
+	@$(SITE_VENV)/bin/python -m pip install -qq --disable-pip-version-check --no-input --no-deps --no-build-isolation -e .
 	@touch $@
 
 # The tools of a release see the product's packages and add their own.

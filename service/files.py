@@ -1,11 +1,15 @@
-"""Read files from outside Abbe: plain files only, up to a size limit."""
+"""Read files from outside Abbe: plain files only, up to a size limit. And lock files of its own."""
 
 from __future__ import annotations
 
 import errno
 import os
 import stat
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
+
+from abbe.service.errors import ConfigError
 
 PIECE = 1 << 20
 """Bytes per read: a single read of the whole limit would allocate that much memory even for the smallest file."""
@@ -20,6 +24,34 @@ _KINDS = (
 
 class NotPlainError(OSError):
     """The path is not a plain file, or the file is larger than the limit: ``strerror`` says which."""
+
+
+def file_locks() -> ModuleType:
+    """Return the module of file locks.
+
+    Raises
+    ------
+    ConfigError
+        The system has none (Windows): what needs them cannot work there.
+    """
+    try:
+        return import_module("fcntl")  # here: a system without it still plans, reads and solves
+    except ImportError:
+        raise ConfigError("this system has no file locks: Abbe measures and serves on Linux only", "docs/how-to/windows.md") from None
+
+
+def lock_at_once(descriptor: int) -> None:
+    """Lock an open file for this process.
+
+    Raises
+    ------
+    BlockingIOError
+        Another process holds the lock.
+    ConfigError
+        The system has no such locks.
+    """
+    locks = file_locks()
+    locks.flock(descriptor, locks.LOCK_EX | locks.LOCK_NB)
 
 
 def read_plain(path: Path, most: int) -> bytes:

@@ -16,7 +16,7 @@ class Picture:
     svg: str
 
     def _repr_html_(self) -> str:
-        return f"<div><style>{style_rules()}</style>{self.svg}</div>"
+        return f'<div class="abbe-picture"><style>{style_rules()}.abbe-picture svg{{max-width:100%;height:auto}}</style>{self.svg}</div>'
 
     def save(self, target: str | Path) -> None:
         """Write the picture as an HTML page.

@@ -10,7 +10,6 @@ import asyncio
 import errno
 import os
 import socket
-import termios
 import time
 from collections.abc import Callable, Sequence
 from contextlib import suppress
@@ -22,6 +21,11 @@ from serial.tools import list_ports
 from abbe.drivers.errors import LinkDown, ReplyTimeout, WrongDevice
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.urls import SerialUrl, SocketUrl
+
+try:
+    from termios import error as terminal_error
+except ImportError:  # Windows
+    terminal_error = OSError  # type: ignore[misc,assignment]
 
 
 @dataclass(frozen=True, slots=True)
@@ -240,7 +244,7 @@ class ByteLink:
         if isinstance(self._port, serial.Serial):
             try:
                 self._port.reset_input_buffer()
-            except (OSError, termios.error) as error:  # pyserial passes termios.error on, which is not an OSError
+            except (OSError, terminal_error) as error:  # pyserial passes it on, which is not an OSError
                 raise self._lost("drop input", error) from error
         elif self._port is not None:
             try:
@@ -265,7 +269,7 @@ class ByteLink:
             return
         clock = asyncio.get_running_loop().time
         until_s = clock() + _DRAIN_S
-        with suppress(OSError, termios.error):
+        with suppress(OSError, terminal_error):
             while port.is_open and port.out_waiting and clock() < until_s:  # noqa: ASYNC110 - the system does not signal an empty buffer
                 await asyncio.sleep(_POLL_S)
             if port.is_open:
@@ -285,7 +289,7 @@ class ByteLink:
                 bytesize=self._bits,
                 stopbits=self._stop,
             )
-        except (OSError, ValueError, termios.error) as error:  # SerialException is an OSError, termios.error is not
+        except (OSError, ValueError, terminal_error) as error:  # SerialException is an OSError, that of termios is not
             raise LinkDown(self.name, "open", str(error), serial_remedy(path, error)) from error
         self._adapter = adapter_at(path, listed) or self._adapter
         return port

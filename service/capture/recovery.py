@@ -5,7 +5,6 @@ A segment that cannot be recovered stops neither the others nor the machine: it 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import threading
 import time
@@ -35,6 +34,7 @@ from abbe.service.capture.settings import (
 )
 from abbe.service.domain.measured import INTERRUPTED, RUNNING, ChunkRecord, RunRecord, this_process
 from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
+from abbe.service.files import lock_at_once
 from abbe.service.runs.columns import decode_json
 from abbe.service.storage.store import Store
 
@@ -109,7 +109,7 @@ def is_free(path: Path) -> Iterator[bool]:
 
 def _try_lock(handle: int) -> bool:
     try:
-        fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        lock_at_once(handle)
     except BlockingIOError:
         return False
     return True

@@ -7,7 +7,6 @@ disk space for closing a run on a full disk, and the scan that finds the valid p
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import os
 import struct
@@ -19,6 +18,7 @@ from pathlib import Path
 from typing import Protocol
 
 from abbe.service.errors import CaptureFault, DiskFull
+from abbe.service.files import lock_at_once
 
 _PIECE = 1 << 20
 
@@ -66,8 +66,8 @@ class RealFileIO:
         """Create a file, refusing an existing one; return a descriptor, whose lock shows other processes a running recording."""
         descriptor = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, 0o640)
         try:
-            fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            lock_at_once(descriptor)
+        except BaseException:
             os.close(descriptor)
             raise
         return descriptor

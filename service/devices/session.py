@@ -10,7 +10,6 @@ Every controller status is noted with its arrival time (`notes_since`): many suc
 from __future__ import annotations
 
 import errno
-import fcntl
 import hashlib
 import os
 import stat
@@ -29,6 +28,7 @@ from abbe.drivers.errors import DriverError
 from abbe.service.domain.machine import DeviceUrls as DeviceUrls
 from abbe.service.domain.machine import address_of
 from abbe.service.errors import AbbeError, ConfigError, DevicesNotReady, MachineInUse, UnsafeToMove
+from abbe.service.files import lock_at_once
 
 ENVIRONMENT = "ABBE_LOCK_FOLDER"
 """Environment variable that names another folder for the locks, where the default ones do not work (containers)."""
@@ -123,7 +123,7 @@ def _locked(path: Path) -> int:
     for _ in range(TRIES):
         handle = _opened(path)
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            lock_at_once(handle)
             if os.path.samestat(os.fstat(handle), path.stat()):
                 return handle
         except BlockingIOError:

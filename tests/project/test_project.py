@@ -114,7 +114,7 @@ def test_nothing_is_imported_but_through_abbe() -> None:
     assert [p for p in (*SOURCES, *(ROOT / "tests").rglob("*.py")) if bare.search(p.read_text())] == []
 
 
-@pytest.mark.parametrize("name", [*LOCKS, "requirements-release.lock"])
+@pytest.mark.parametrize("name", [*LOCKS, "requirements-release.lock", "requirements-site.lock"])
 def test_lock_file_pins_by_hash_and_names_no_address(name: str) -> None:
     text = (ROOT / name).read_text()
     assert "://" not in text

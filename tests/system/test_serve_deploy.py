@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import re
 import subprocess
+import tomllib
 from contextlib import closing
 from pathlib import Path
 
 import pytest
+import yaml
 
 from abbe.service.cli.administration.serve import setup_of
 from abbe.service.config import load_machine
@@ -82,6 +84,30 @@ def test_containers_stay_on_this_computer() -> None:
     images = re.findall(r"(?m)^\s*image: (\S+)", compose) + re.findall(r"(?m)^FROM (\S+)", (DEPLOY / "Dockerfile").read_text())
     assert not any("." in image.split("/")[0] for image in images if "/" in image), "a registry's address"
     assert "password" not in re.sub(r"postgres_password|POSTGRES_PASSWORD_FILE|/secrets/\S+", "", compose).lower()
+
+
+def test_the_image_copies_what_is_here_and_what_the_build_needs() -> None:
+    text = (DEPLOY / "Dockerfile").read_text()
+    copied = [word for line in re.findall(r"(?m)^COPY (?!--from)(.+)$", text) for word in line.split()[:-1]]
+    assert [name for name in copied if not (ROOT / name).exists()] == []
+    passed = {line[1:] for line in (DEPLOY / "Dockerfile.dockerignore").read_text().splitlines() if line.startswith("!")}
+    assert set(copied) == passed
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    parts = {"abbe", *(link.readlink().name for link in (ROOT / "abbe").iterdir() if link.is_symlink())}
+    assert parts | {project["readme"], *project["license-files"], "pyproject.toml", "requirements.lock"} <= set(copied)
+
+
+def test_compose_names_what_it_uses() -> None:
+    """Docker itself is not here: what a service needs is declared, and what is declared is used."""
+    doc = yaml.safe_load((DEPLOY / "compose.yaml").read_text())
+    services = doc["services"].values()
+    assert {name for one in services for name in one.get("depends_on", {})} <= set(doc["services"])
+    assert {name for one in services for name in one.get("secrets", [])} == set(doc["secrets"])
+    mounted = {part.partition(":")[0] for one in services for part in one.get("volumes", [])}
+    assert {name for name in mounted if not name.startswith(".")} == set(doc["volumes"])
+    assert [name for name in mounted if name.startswith("./") and name != "./machine.toml" and not (DEPLOY / name).exists()] == []
+    build = doc["services"]["abbe"]["build"]
+    assert (DEPLOY / build["context"] / build["dockerfile"]).samefile(DEPLOY / "Dockerfile")
 
 
 def test_the_rules_are_what_udev_reads() -> None:

@@ -49,9 +49,11 @@ def serve(
 ) -> None:
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from abbe.service.config import load_machine
+    from abbe.service.files import file_locks
     from abbe.service.logs import configure_logs
     from abbe.service.serve import serve as run
 
+    file_locks()
     setup = setup_of(load_machine(machine_file(machine)), port)
     configure_logs(as_json=as_json)
     code = run(setup, once=once)
