@@ -110,7 +110,8 @@ def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None
     """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     if test == "laser_linear" and setup.axis and not span.any():
         stood = "the axis stood still: readings over time tell no geometry, only a report shows them"
-        return GeometryMistake(stood, "leave the run out (--without), or import it as a campaign of its own")
+        remedy = "leave the run out (--without); such runs alone, with temperatures, show the thermal response (abbe discover)"
+        return GeometryMistake(stood, remedy)
     unit = span / max(float(np.linalg.norm(span)), 1e-9)
     beam = setup.nominal_beam
     if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):

@@ -28,6 +28,7 @@ TEMPERATURES = {"C": 0.0, "K": -273.15}
 PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1000.0}
 POSSIBLE_PA = (60_000.0, 110_000.0)
 MOST_ROWS = 200_000
+Sensor = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]{0,40}$")]
 Column = Annotated[str | int, Field(description="heading of the column, or its number from 1")]
 
 
@@ -57,9 +58,10 @@ def toml_of(columns: ColumnFile) -> str:
     doc = columns.model_dump(exclude_none=True, exclude_defaults=True)
     plain = {key: value for key, value in doc.items() if not isinstance(value, dict)}
     lines = ['format = "abbe-columns/1"', *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
-    for key, part in doc.items():
-        if isinstance(part, dict):
-            lines += [f"\n[{key}]", *(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in part.items())]
+    tables = {key: part for key, part in doc.items() if isinstance(part, dict)}
+    tables |= {f"temperatures.{name}": part for name, part in tables.pop("temperatures", {}).items()}
+    for key, part in tables.items():
+        lines += [f"\n[{key}]", *(f"{name} = {json.dumps(value, ensure_ascii=False)}" for name, value in part.items())]
     return "\n".join(lines) + "\n"
 
 
@@ -67,8 +69,8 @@ class ColumnFile(ColumnFilePart):
     """What the columns of a table are (``abbe-columns/1``, TOML).
 
     ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. Without ``target`` the axis stood at
-    ``at_mm``, and ``time``, or ``every_s`` from row to row, says when it was read. ``heading``: row of the headings, 0 for none; rows above
-    it are not read. ``decimal``: the decimal sign of a text file.
+    ``at_mm``, and ``time``, or ``every_s`` from row to row, says when it was read. ``temperatures``: further sensors by name. ``heading``:
+    row of the headings, 0 for none; rows above it are not read. ``decimal``: the decimal sign of a text file.
     """
 
     format: Literal["abbe-columns/1"] = "abbe-columns/1"
@@ -84,6 +86,7 @@ class ColumnFile(ColumnFilePart):
     spindle_temperature: MeasuredColumn | None = None
     air_temperature: MeasuredColumn | None = None
     air_pressure: MeasuredColumn | None = None
+    temperatures: dict[Sensor, MeasuredColumn] = Field(default_factory=dict)
     heading: int = Field(default=1, ge=0, le=1000)
     delimiter: Literal[",", ";", "tab", "blank"] | None = None
     decimal: Literal[".", ","] = "."
@@ -95,8 +98,9 @@ class ColumnFile(ColumnFilePart):
             raise ValueError("expected either measured (positions) or deviation, got " + ("none" if self.measured is None else "both"))
         if (self.target is None) != (self.at_mm is not None and (self.time or self.every_s) is not None):
             raise ValueError("expected either target, or at_mm (where the axis stood) with time or every_s")
-        for name, units in _UNITS.items():
-            one = getattr(self, name)
+        stated = [(name, getattr(self, name), units) for name, units in _UNITS.items()]
+        stated += [(f"temperatures.{name}", one, TEMPERATURES) for name, one in self.temperatures.items()]
+        for name, one, units in stated:
             if one is not None and one.unit not in units:
                 raise ValueError(f"{name}.unit is {one.unit!r}, expected one of {', '.join(units)}")
         return self
@@ -236,8 +240,11 @@ class _ReadingRows:
 
     def numbers(self, name: str) -> tuple[F1, list[str]]:
         """Values of a column of the column file, in its unit, and their words."""
-        what, k = name.replace("_", " "), self.index(getattr(self.columns, name).column)
-        words = []
+        return self.values(getattr(self.columns, name), name.replace("_", " "))
+
+    def values(self, one: MeasuredColumn, what: str) -> tuple[F1, list[str]]:
+        """Values of a column, in its unit, and their words."""
+        k, words = self.index(one.column), list[str]()
         for row, (_, cells) in enumerate(self.rows):
             if len(cells) <= k:
                 raise self.wrong(row, f"{len(cells)} cells, {what} is in column {k + 1}")
@@ -353,23 +360,23 @@ def _times(body: _ReadingRows) -> F1 | None:
 
 
 def _further(body: _ReadingRows) -> dict[str, F1]:
-    names = {
-        "scale_temperature": f"temp_{body.columns.axis.lower()}_C",
-        "spindle_temperature": "temp_spindle_C",
-        "air_temperature": "temp_air_C",
-        "air_pressure": "pressure_air_Pa",
-    }
-    out = {}
-    for name, column in names.items():
-        one: MeasuredColumn | None = getattr(body.columns, name)
+    columns = body.columns
+    stated = [
+        ("scale temperature", f"temp_{columns.axis.lower()}_C", columns.scale_temperature),
+        ("spindle temperature", "temp_spindle_C", columns.spindle_temperature),
+        ("air temperature", "temp_air_C", columns.air_temperature),
+        ("air pressure", "pressure_air_Pa", columns.air_pressure),
+        *((f"temperature {name}", f"temp_{name}_C", one) for name, one in columns.temperatures.items()),
+    ]
+    out = dict[str, F1]()
+    for what, column, one in stated:
         if one is not None:
-            values = body.numbers(name)[0]
+            values = body.values(one, what)[0]
             values = values + TEMPERATURES[one.unit] if one.unit in TEMPERATURES else values * PRESSURES[one.unit]
             low, high = (COLDEST_C, WARMEST_C) if one.unit in TEMPERATURES else POSSIBLE_PA
             odd = np.flatnonzero((values < low) | (values > high))
             if odd.size:
-                what = f"{name.replace('_', ' ')} is {values[odd[0]]:g}, expected {low:g} to {high:g}: is the unit {one.unit}?"
-                raise body.wrong(int(odd[0]), what)
+                raise body.wrong(int(odd[0]), f"{what} is {values[odd[0]]:g}, expected {low:g} to {high:g}: is the unit {one.unit}?")
             out[column] = values
     return out
 

@@ -40,7 +40,8 @@ def discover(  # noqa: PLR0913 - one argument for each option
     """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
-    only if --db or -m names a database. After Ctrl-C the same command resumes.
+    only if --db or -m names a database. After Ctrl-C the same command resumes. Runs at standstill with temperatures show the thermal
+    response instead (ISO 230-3), which is not stored.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc
@@ -52,6 +53,8 @@ def discover(  # noqa: PLR0913 - one argument for each option
     if live:
         machine = _checked_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
+        if _standstill(found, plain=report is None and not live, as_json=as_json):
+            return
         job, journal = _started(found, store)
         finding = _searched(job, journal)
         if live and store is not None and machine is not None:
@@ -68,6 +71,21 @@ def discover(  # noqa: PLR0913 - one argument for each option
     more = finding.next_test is not None and store is not None
     then = f"abbe discover {quote(campaign)} --live" if more else f"abbe solve {quote(campaign)}"
     conclude(then, machine=machine, db=None if more else db)
+
+
+def _standstill(campaign: Campaign, *, plain: bool, as_json: bool) -> bool:
+    """Print the thermal response of runs at standstill; False if these are other runs."""
+    from abbe.service.cli.common import answer
+    from abbe.service.discovery.standstill import answer_doc, at_standstill, lines_of, standstill_answer
+    from abbe.service.errors import ConfigError
+
+    if not at_standstill(campaign.runs):
+        return False
+    if not plain:
+        raise ConfigError("--report and --live are not for runs at standstill", "leave them out; --json gives all figures")
+    found = standstill_answer(campaign.name, campaign.runs)
+    answer(answer_doc(found), *lines_of(found), as_json=as_json)
+    return True
 
 
 @contextmanager

@@ -1,0 +1,103 @@
+"""Test at standstill (ISO 230-3): a model of the thermal response, judged on runs that it has not seen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.models.evaluation.thermal_response import LEAST_RUNS, Series, Shift, StandstillRun, ThermalResponse, probability_shifted
+
+COVERED = 0.95
+"""Share of readings that U (k = 2) has to cover in runs left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class LeftOut:
+    """Every run predicted from all the others; the rms over each run counts alike, mm.
+
+    ``predicted_mm``, ``u_mm``: by run, (n,) each; ``raw_mm``: of the displacements; ``static_mm``: after changes of temperature at once
+    (least squares); ``response_mm``; ``covered``: share of readings within U (k = 2), widened as all other runs need it.
+    """
+
+    predicted_mm: tuple[F1, ...]
+    u_mm: tuple[F1, ...]
+    raw_mm: float
+    static_mm: float
+    response_mm: float
+    covered: float
+
+
+@dataclass(frozen=True, eq=False)
+class Standstill:
+    """Result of a test. ``since_start``: the better model takes changes since the start of each run; ``left_out``, ``response``: of it.
+
+    ``shift_absolute``, ``shift_since_start``: an offset of some runs that temperatures as they are do not explain, and one that changes of
+    temperature do not; None without one. The zero of each run decides which of them shows.
+    """
+
+    since_start: bool
+    response: ThermalResponse
+    left_out: LeftOut
+    shift_absolute: Shift | None
+    shift_since_start: Shift | None
+
+
+def standstill(runs: Sequence[StandstillRun]) -> Standstill:
+    """Fit the response of runs in their order by the model that predicts runs left out better.
+
+    Raises
+    ------
+    ValueError
+        There are fewer than `LEAST_RUNS` runs.
+    """
+    if len(runs) < LEAST_RUNS:
+        raise ValueError(f"{len(runs)} runs at standstill, expected {LEAST_RUNS} or more: fewer do not tell heat from time")
+    series = [Series(runs, since_start=way) for way in (False, True)]
+    absolute, since_start = (one.response() for one in series)
+    judged = [_left_out(one) for one in series]
+    better = judged[1][0].response_mm < judged[0][0].response_mm
+    left, widening = judged[better]
+    response = replace(since_start if better else absolute, widening=widening)
+    return Standstill(better, response, left, absolute.shift, since_start.shift)
+
+
+def _left_out(series: Series) -> tuple[LeftOut, float]:
+    """Predict every run from all the others; also the factor by which u must be widened to cover them."""
+    predicted, u, static = list[F1](), list[F1](), list[F1]()
+    for k, run in enumerate(series.runs):
+        kept = [i for i in range(len(series.runs)) if i != k]
+        found = series.response(kept)
+        mean, sd = found.predict(run, probability_shifted(found.shift, kept, k))
+        predicted.append(mean)
+        u.append(sd)
+        static.append(_static([series.runs[i] for i in kept], run))
+    y = [r.displacement_mm for r in series.runs]
+    ratio = [np.abs(a - b) / c for a, b, c in zip(y, predicted, u, strict=True)]
+    u = [sd * _widening([r for i, r in enumerate(ratio) if i != k]) for k, sd in enumerate(u)]
+    covered = np.concatenate([np.abs(a - b) <= 2.0 * c for a, b, c in zip(y, predicted, u, strict=True)])
+    raw, simple, lagged = (_by_run(y, other) for other in ([0.0 * v for v in y], static, predicted))
+    return LeftOut(tuple(predicted), tuple(u), raw, simple, lagged, float(covered.mean())), _widening(ratio)
+
+
+def _widening(ratio: Sequence[F1]) -> float:
+    """Factor on u, 1 or more, with which 2 u covers its share of errors; ``ratio``: error over u of each run."""
+    return max(1.0, 0.5 * float(np.quantile(np.concatenate(ratio), COVERED)))
+
+
+def _by_run(y: Sequence[F1], predicted: Sequence[F1]) -> float:
+    return rms(np.array([rms(a - b) for a, b in zip(y, predicted, strict=True)]))
+
+
+def rms(values: F1) -> float:
+    """Root mean square."""
+    return float(np.sqrt(np.mean(values**2)))
+
+
+def _static(others: Sequence[StandstillRun], run: StandstillRun) -> F1:
+    """Prediction of a run by the changes of temperature of the others, at once."""
+    changes = np.concatenate([r.temperatures_c - r.temperatures_c[0] for r in others])
+    slopes = np.linalg.lstsq(changes, np.concatenate([r.displacement_mm for r in others]), rcond=None)[0]
+    return np.asarray((run.temperatures_c - run.temperatures_c[0]) @ slopes)
