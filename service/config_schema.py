@@ -16,6 +16,7 @@ from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interv
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
+from abbe.service.push.limits import PushLimits
 from abbe.service.storage.engine import parse_url as parse_database
 
 Positive = Annotated[float, Field(gt=0.0)]
@@ -164,6 +165,18 @@ class Limits(ConfigTable):
     settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
         default=10.0, description="how long all conditions must be clear before the measurement resumes"
     )
+
+    def for_push(self) -> PushLimits:
+        """The limits for tables, in mm."""
+        return PushLimits(
+            value_mm=self.table_value_um * 1e-3,
+            beyond=self.table_beyond_percent * 1e-2,
+            change_mm=self.table_change_um * 1e-3,
+            step_mm=self.table_step_um * 1e-3,
+            walk_mm=self.table_walk_um * 1e-3,
+            temperature_c=self.temperature_c,
+            age_h=self.measurement_age_h,
+        )
 
 
 class AxisCoefficients(ConfigTable):

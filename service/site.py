@@ -11,7 +11,7 @@ import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
-from abbe.service.config_schema import Limits, MachineFile
+from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine import AxisMaterial, DeviceUrls, control_of
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
@@ -88,7 +88,7 @@ def site_of(config: MachineFile) -> Site:
         machine_from_doc(doc),
         doc,
         DeviceUrls(devices.cnc, devices.ballbar, devices.laser, devices.fixture),
-        push_limits(limits),
+        limits.for_push(),
         limits.feed_mm_min,
         limits.temperature_c,
         CaptureSettings(config.store.capture, int(config.store.capture_reserve_mib * MIB), config.store.keep_segments),
@@ -97,17 +97,4 @@ def site_of(config: MachineFile) -> Site:
         {kind: day for kind, day in (("ballbar", config.calibration.ballbar), ("laser", config.calibration.laser)) if day is not None},
         limits.two_people,
         config.material.by_axis(),
-    )
-
-
-def push_limits(limits: Limits) -> PushLimits:
-    """Return the machine file's limits for tables, in mm."""
-    return PushLimits(
-        value_mm=limits.table_value_um * 1e-3,
-        beyond=limits.table_beyond_percent * 1e-2,
-        change_mm=limits.table_change_um * 1e-3,
-        step_mm=limits.table_step_um * 1e-3,
-        walk_mm=limits.table_walk_um * 1e-3,
-        temperature_c=limits.temperature_c,
-        age_h=limits.measurement_age_h,
     )
