@@ -127,7 +127,7 @@ class Item:
     @property
     def setup(self) -> str:
         """Name of the set-up in the plan."""
-        return str(self.test.setup["setup_id"])
+        return self.test.setup_id
 
     def attempt(self) -> Attempt:
         """Return this state as the runner needs it for its next attempt."""
@@ -139,7 +139,7 @@ def items(plan: CampaignPlan) -> tuple[Item, ...]:
     made: list[Item] = []
     firsts: dict[str, TestPlan] = {}
     for test in plan.tests:
-        first = firsts.setdefault(str(test.setup["setup_id"]), test)
+        first = firsts.setdefault(test.setup_id, test)
         before = end_of(made[-1].test) if made and first is not test and not test.mounts else None
         made.append(Item(test, first, test, test, before=before))
     return tuple(made)

@@ -268,7 +268,7 @@ async def listen_campaign(
         try:
             async with recording(store, run_id, site.capture, clock, about) as recorder:
                 end = await listen_to(session, recorder, test, report)
-            under_way.mounted_us[test.setup["setup_id"]] = end["mounted_us"]
+            under_way.mounted_us[test.setup_id] = end["mounted_us"]
             status, reason = "complete", ""
             if any(isinstance(step, Unmount) for step in test.steps):
                 await session.need_fixture().unmount()

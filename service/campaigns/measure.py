@@ -380,7 +380,7 @@ async def measure_test(  # noqa: PLR0913 - a test, its devices, its destination,
     finally:
         mounted_us = end.get("mounted_us", runner.mounted_us)
         if mounted_us is not None:
-            campaign.mounted_us[test.setup["setup_id"]] = end["mounted_us"] = mounted_us
+            campaign.mounted_us[test.setup_id] = end["mounted_us"] = mounted_us
         end |= {"ended_utc": clock.utc().isoformat(), "clock_pairs": notes_since(session.controller, doc["clock"]["ctrl_us"])}
         end |= {} if recorder is None else recorder.doc()
         end |= {} if runner.way is None or status == "complete" else runner.way.doc()
@@ -409,7 +409,7 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
     table = await _table_in_force(session)
     ctrl0_us, set_us = campaign.ctrl0_us, status.ctrl_us
     if not test.mounts:
-        set_us = campaign.mounted_us.get(test.setup["setup_id"], set_us)
+        set_us = campaign.mounted_us.get(test.setup_id, set_us)
     doc: dict[str, Any] = {
         "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
         "machine": site.doc,

@@ -89,7 +89,7 @@ def _remaining(tests: tuple[TestPlan, ...], states: dict[str, str]) -> tuple[Tes
     Another process cannot resume a set-up, because the bar may have moved or been removed.
     """
     out: list[TestPlan] = []
-    for _, members in groupby(tests, key=lambda test: str(test.setup["setup_id"])):
+    for _, members in groupby(tests, key=lambda test: test.setup_id):
         group, attempt = tuple(members), 1
         while any(_attempt(t, attempt).label in states for t in group):
             if all(states.get(_attempt(t, attempt).label) == COMPLETE for t in group):
@@ -106,7 +106,7 @@ def _attempt(test: TestPlan, number: int) -> TestPlan:
     """Return the test for the n-th mounting of its set-up, with its own label and set-up name."""
     if number == 1:
         return test
-    return replace(test, label=f"{test.label}-{number}", setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
+    return replace(test.in_setup(f"{test.setup_id}-{number}"), label=f"{test.label}-{number}")
 
 
 async def measure_added(

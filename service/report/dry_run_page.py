@@ -50,7 +50,7 @@ def picture(machine: Machine, plan: CampaignPlan, unit: Unit = MM) -> str:
 def _row(k: int, test: TestPlan, run: DryRun) -> tuple[str, ...]:
     extent = (f"{run.lowest_mm[a]:.0f} to {run.highest_mm[a]:.0f}" for a in range(3))
     numbers = (f"{run.duration_s:.0f}", f"{run.path_mm:.0f}", *extent, f"{run.fastest_mm_min:.0f}", str(run.readings))
-    return (str(k), run.label, str(test.setup["setup_id"]), NAMES.get(run.test, run.test), *numbers)
+    return (str(k), run.label, test.setup_id, NAMES.get(run.test, run.test), *numbers)
 
 
 def _drawn(order: int, test: TestPlan) -> DrawnTest:

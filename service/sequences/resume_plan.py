@@ -404,7 +404,7 @@ def anew(test: TestPlan, number: int) -> TestPlan:
     """Return the test for mounting ``number``: from the second on, the number is appended to the set-up's name."""
     if number == 1:
         return test
-    return replace(test, setup=test.setup | {"setup_id": f"{test.setup['setup_id']}-{number}"})
+    return test.in_setup(f"{test.setup_id}-{number}")
 
 
 def end_of(test: TestPlan) -> Point | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 Point = tuple[float, float, float]
@@ -182,6 +182,15 @@ class TestPlan:
     def mounts(self) -> bool:
         """Whether the test begins a set-up; else it uses that of an earlier test."""
         return any(isinstance(step, MountBar | MountLaser | MountArtefact) for step in self.steps)
+
+    @property
+    def setup_id(self) -> str:
+        """Name of the set-up in the plan."""
+        return str(self.setup["setup_id"])
+
+    def in_setup(self, setup_id: str) -> TestPlan:
+        """The same test in a set-up of another name, mounted alike."""
+        return replace(self, setup=self.setup | {"setup_id": setup_id})
 
 
 @dataclass(frozen=True, slots=True)

@@ -124,7 +124,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
     if any(isinstance(s, TouchFeature) for t in plan.tests for s in t.steps):
         raise ConfigError("an NC program of Abbe does not touch", "use the control's own measuring cycles, and import their points")
     for test in plan.tests:
-        blocks.append(Comment(f"test {test.label}: {test.test} in set-up {test.setup['setup_id']}"))
+        blocks.append(Comment(f"test {test.label}: {test.test} in set-up {test.setup_id}"))
         for block in _test(test, arcs):
             if isinstance(block, Dwell) and block.reading:
                 count += 1
