@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import replace
-from datetime import date
+from datetime import date, datetime
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ from abbe.service.config_schema import MachineFile
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
+from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError, TableMismatch
 from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts, push_log
@@ -25,7 +26,6 @@ from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
 from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
-from abbe.service.report.later_changes import with_later_changes
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
 from abbe.service.report.report_parts import Doc, Rules
@@ -36,7 +36,42 @@ from abbe.service.tables.nine_tables import tables_from_image
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.iso_report import Evaluated, evaluate
 from abbe.service.verification.reduction import holds_at
+from abbe.service.verification.verified_by import VerifiedBy, verified_by
 from abbe.service.verification.verify import COVERAGE
+
+NOT_JUDGED = "Not judged"
+
+
+def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[Run]) -> Document:
+    """Return the report, with a note if its table is not in force now. The verdict says so, too.
+
+    ``begun_utc``: time of the measurement, or end of the push. ``runs``: of the report; empty: only the time counts.
+    """
+    known = verified_by(store, machine)
+    if document.verdict is None or _same(known, begun_utc, runs):
+        return document
+    sign, word, text = document.verdict
+    now = known.text[:1].upper() + known.text[1:]
+    remark = f"this report is about the table in force at that time, not about the table in force now: {known.text}"
+    verdict = document.verdict
+    if known.state == "unverified" and word != NOT_JUDGED:
+        verdict = ("open", "Unverified now", f"{now}. When this was measured: {word}. {text}".strip())
+    elif sign != "open":
+        verdict = ("open", f"{word} then", f"{text} Another table is in force now: {known.text}.".strip())
+    return replace(document, verdict=verdict, remarks=[remark, *document.remarks])
+
+
+def _same(known: VerifiedBy, begun_utc: str, runs: Sequence[Run]) -> bool:
+    """Whether the report was measured with the table in force now."""
+    if known.why in ("changed", "open", "journal"):
+        return False
+    tables = {r.table.crc for r in runs if r.table.crc is not None}
+    if known.why == "push" and tables == {known.crc}:  # measured during the push, before it was kept
+        return True
+    if known.since is not None and datetime.fromisoformat(begun_utc) < known.since:
+        return False
+    return known.crc is None or tables <= {known.crc}
+
 
 MANY = 10**6
 AXES = "XYZ"
