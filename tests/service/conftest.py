@@ -125,3 +125,12 @@ def write_campaign(folder: Path) -> Path:
 def write_json(path: Path, document: object) -> None:
     """Write JSON, NaN included: a test may want it."""
     path.write_text(json.dumps(document), encoding="utf-8")
+
+
+@pytest.fixture(params=["sqlite", "postgresql"])
+def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
+    """An empty database that several connections can share: once as a file, once on a PostgreSQL."""
+    if request.param == "sqlite":
+        return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
+    make: Callable[[], str] = request.getfixturevalue("postgres")
+    return make()

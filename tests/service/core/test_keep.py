@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sqlite3
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -30,14 +30,6 @@ class NoWait(FakeClock):
 
     async def sleep(self, s: float) -> None:
         self.pauses.append(s)
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    make: Callable[[], str] = request.getfixturevalue("postgres")
-    return make()
 
 
 @pytest.fixture

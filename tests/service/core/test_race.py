@@ -7,11 +7,8 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from datetime import timedelta
 from pathlib import Path
-
-import pytest
 
 from abbe.service.storage.store import Store
 from tests.service.core import racing_child
@@ -19,14 +16,6 @@ from tests.service.core.racing_child import FIRST
 
 COUNT = 1000 if os.environ.get("ABBE_TEST_LONG") else 200
 ROOT = Path(__file__).resolve().parents[3]
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    make: Callable[[], str] = request.getfixturevalue("postgres")
-    return make()
 
 
 def child(url: str) -> subprocess.Popen[str]:

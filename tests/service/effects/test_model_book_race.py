@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -30,15 +30,6 @@ from tests.service.discovery.discovery_bench import Search, write_case
 
 NAME = "VMC-1"
 ALL = ["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED"]
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    """An empty database that two connections can share."""
-    if request.param == "postgresql":
-        make: Callable[[], str] = request.getfixturevalue("postgres")
-        return make()
-    return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
 
 
 @pytest.fixture

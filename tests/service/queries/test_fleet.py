@@ -32,14 +32,6 @@ CHECKS = 12
 NOW = datetime(2026, 11, 22, 9, tzinfo=UTC)
 
 
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    if request.param == "sqlite":
-        return f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
-    make: Callable[[], str] = request.getfixturevalue("postgres")
-    return make()
-
-
 def test_two_services_at_once_are_not_mixed(url: str) -> None:
     """Each with its timetable at the same seconds, as plants have it: slots, campaigns, runs and checks of one name in each."""
     Store.open(url).close()

@@ -3,18 +3,10 @@
 from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-
-import pytest
 
 from abbe.service.domain.decisions import ProposalRejection
 from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.store import Store
-
-
-@pytest.fixture(params=["sqlite", "postgresql"])
-def url(request: pytest.FixtureRequest, tmp_path: Path) -> str:
-    return request.getfixturevalue("postgres")() if request.param == "postgresql" else f"sqlite:///{tmp_path / 'abbe.sqlite3'}"
 
 
 def test_pages_of_everything(url: str) -> None:
