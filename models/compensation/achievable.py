@@ -358,20 +358,6 @@ def achievable(
     return (*rows, *(judge.grid(n, None) for n in grid_nodes))
 
 
-def grid_row(
-    solution: JointSolution,
-    nodes: int,
-    *,
-    lsb_mm: float = 0.0,
-    compensable: Mask | None = None,
-    pairs: Pairs | None = None,
-    sources: ErrorSources | None = None,
-) -> Achievable:
-    """Predict the accuracy of a 3-D grid of ``nodes`` per axis; other parameters as in `achievable` and `grid_table`."""
-    judge = _ResidualJudge(solution, pairs or random_pairs(inner_box_mm(solution.machine)), sources or error_sources(solution), lsb_mm)
-    return judge.grid(nodes, compensable)
-
-
 @dataclass(frozen=True, eq=False)
 class _ResidualJudge:
     """Judge of all kinds of table, by the same pairs, sources of uncertainty and unit."""

@@ -86,13 +86,6 @@ def joined(arcs: tuple[Array, Array, Array]) -> Path:
     return as_points(points), None if whole else (first, first + len(middle) - 1)
 
 
-def reversed_path(path: Path) -> Path:
-    """Return the same path the other way round."""
-    points, measured = path
-    last = len(points) - 1
-    return points[::-1], None if measured is None else (last - measured[1], last - measured[0])
-
-
 @dataclass(frozen=True, slots=True)
 class Helix(CupTest):
     """Hemispherical helix of the ball-bar test: continuous at constant feed, from pole to equator or (direction -1) back.
