@@ -59,6 +59,7 @@ class NamedEffect:
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
     needed : ratio of the holdout runs' rms without this effect to that with it; 1 or less: not needed. None: no holdout run, or a variance
         effect, which changes no mean reading.
+    sensor_doubt : why the temperature column of the warming part is probably another's; empty without doubt.
     """
 
     name: str
@@ -73,6 +74,7 @@ class NamedEffect:
     location: Localization = field(default_factory=Localization)
     forms: tuple[str, ...] = ()
     needed: float | None = None
+    sensor_doubt: str = ""
 
     @property
     def label(self) -> str:

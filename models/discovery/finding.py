@@ -20,6 +20,7 @@ from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexp
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
 from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
+from abbe.models.discovery.sensors import exchanged_sensor
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
 from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures, wandering
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping
@@ -300,7 +301,10 @@ def _judge(
     }
     left = {**residues(names, frozenset(e.label for e in scatter)), **left}
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
-    unnamed = tuple(sorted((*structures(problem.case, found, loud), *waves, *wandering(problem)), key=lambda s: (-s.evidence, s.label)))
+    wander = wandering(problem)
+    least = REST_SHARE * max((w.evidence for w in wander), default=0.0)  # noise that wanders has waves and moments by chance
+    shapes = [s for s in structures(problem.case, found, loud) if s.evidence > least]
+    unnamed = tuple(sorted((*shapes, *waves, *wander), key=lambda s: (-s.evidence, s.label)))
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
@@ -408,6 +412,7 @@ def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: i
     return NamedEffect(
         pick.effect.name, pick.key, strength, u, shape, c, cov, 0.5 * found.score,
         tuple((r.pick.label, 0.5 * r.deficit) for r in rivals), location, tuple(f.name for f in pick.forms),
+        sensor_doubt=exchanged_sensor(problem.paths, pick.effect.name, pick.key, pick.values),
     )  # fmt: skip
 
 

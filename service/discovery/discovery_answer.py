@@ -49,6 +49,7 @@ def _effect(e: EffectFound) -> dict[str, Any]:
         "alternatives": [rival.label for rival in e.alternatives],
         "forms": list(e.forms),
     }
+    doc |= {"sensor_doubt": e.sensor_doubt} if e.sensor_doubt else {}
     return doc if e.proved is None else doc | {"proved": e.proved}
 
 

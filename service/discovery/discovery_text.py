@@ -172,6 +172,8 @@ def effect_lines(effect: EffectFound) -> list[str]:
     there = location_lines(effect.location)
     if there:
         lines.append("  where: " + "; ".join(there))
+    if effect.sensor_doubt:
+        lines.append(f"  look at the data: {effect.sensor_doubt}")
     lines.append("  what else it could be: " + "; ".join(rival_lines(effect)))
     return lines
 

@@ -96,6 +96,7 @@ def effect_found(named: NamedEffect, effect: Effect, by_name: Mapping[str, Effec
         signature=effect.signature,
         source=effect.source,
         location=named.location,
+        sensor_doubt=named.sensor_doubt,
     )
 
 

@@ -27,7 +27,8 @@ Adds = Literal[
 class FoundEffect(FileObject):
     """One named effect. ``parameters``: ``strength`` and its standard uncertainty ``u_strength`` in the effect's unit, and further ones.
 
-    ``proved``: whether runs that were never fitted confirm the effect.
+    ``proved``: whether runs that were never fitted confirm the effect. ``sensor_doubt``: why the temperature column of the warming part is
+    probably another's.
     """
 
     name: str
@@ -36,6 +37,7 @@ class FoundEffect(FileObject):
     evidence: float
     alternatives: list[str]
     proved: bool | None = None
+    sensor_doubt: str = ""
 
 
 class FoundBeside(FileObject):

@@ -149,11 +149,16 @@ class EffectSize:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class EffectFound(EffectSize):
-    """An effect of a finding. ``proved``: whether runs that were never fitted confirm it; None: not judged."""
+    """An effect of a finding.
+
+    ``proved``: whether runs that were never fitted confirm it; None: not judged. ``sensor_doubt``: why the temperature column of the
+    warming part is probably another's; empty without doubt.
+    """
 
     alternatives: tuple[RivalEffect, ...] = ()
     signature: str = ""
     proved: bool | None = None
+    sensor_doubt: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

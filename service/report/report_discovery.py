@@ -181,6 +181,7 @@ def _card(effect: EffectFound) -> dict[str, str]:
     there = "; ".join(location_lines(effect.location))
     out = {"What to do": effect.remedy_text, "What removes it": REMEDIES[effect.remedy]}
     out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
+    out |= {"Look at the data": effect.sensor_doubt} if effect.sensor_doubt else {}
     out |= {name.replace("_", " ").capitalize(): parameter_text(p) for name, p in effect.parameters.items()}
     out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much likelier the effect makes the readings, less its penalty)"
     if effect.forms:
