@@ -16,7 +16,7 @@ import pytest
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaigns.measure import measure
-from abbe.service.compensation.correct import load_runs
+from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
