@@ -12,11 +12,12 @@ from abbe.service.cli.common import JsonOption, MachineOption, conclude, machine
 
 if TYPE_CHECKING:
     from abbe.service.campaigns.plan import PlannedCampaign
+    from abbe.service.site import Site
 
 HEADINGS = ("no", "label", "measurement", "min", "until min", "worst U µm", "mean U µm")
 
 
-def plan(
+def plan(  # noqa: PLR0913 - one argument for each option
     minutes: Annotated[float, typer.Option(min=1.0, max=1440.0, help="Available minutes, set-ups included.")] = 60.0,
     goal_um: Annotated[
         float | None, typer.Option(min=0.001, help="Wanted worst U = 2u of the deviation, µm; the plan ends when it is reached.")
@@ -27,6 +28,9 @@ def plan(
     ] = None,
     instruments: Annotated[
         Path | None, typer.Option("--instruments", metavar="FILE.toml", help="Bars, noise and set-up times; default: usual ones.")
+    ] = None,
+    artefact: Annotated[
+        Path | None, typer.Option("--artefact", metavar="FILE.toml", help="Plan poses of this artefact for the touch probe instead.")
     ] = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -41,6 +45,10 @@ def plan(
 
     file = machine_file(machine)
     site = site_of(load_machine(file).machine)
+    if artefact is not None:
+        _check_targets((out,), (file, artefact))
+        _plan_poses(site, artefact, minutes, out, as_json=as_json)
+        return
     tools = read_instruments(instruments)
     _check_targets((out, picture), (file, instruments))
     if picture is not None:
@@ -57,6 +65,30 @@ def plan(
     _print(planned, out, picture)
     then = f"abbe plan --minutes {minutes:g} --out plan.toml" if out is None else f"abbe measure --recipe {quote(str(out))} --dry-run"
     conclude(then, machine=machine)
+
+
+def _plan_poses(site: Site, artefact: Path, minutes: float, out: Path | None, *, as_json: bool) -> None:
+    """Plan the poses of an artefact; print what each buys, and write the recipe."""
+    from abbe.service.campaigns.plan_poses import HEADINGS as POSE_HEADINGS
+    from abbe.service.campaigns.plan_poses import plan_poses, pose_doc, pose_rows, read_artefact
+    from abbe.service.cli.running import display
+    from abbe.service.rendering.page_file import write_page
+
+    name, plate = read_artefact(artefact)
+    with display() as sink:
+        planned = plan_poses(site, name, plate, minutes, sink)
+    if out is not None:
+        write_page(planned.text, out)
+    if as_json:
+        print_json(pose_doc(planned))
+        return
+    print_table(POSE_HEADINGS, pose_rows(planned), f"{planned.poses[-1].until_min:.0f} minutes, mounting included")
+    rank = planned.poses[-1].rank
+    if rank is not None:
+        typer.echo(rank.text)
+    if out is not None:
+        typer.echo(f"recipe: {out}")
+        conclude(f"abbe measure --recipe {quote(str(out))} --dry-run")
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:

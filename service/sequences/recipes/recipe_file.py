@@ -220,7 +220,7 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
 def _toml(value: Any) -> str:
     """Format a TOML value: for text, numbers and their lists JSON is TOML, except the ASCII DEL; a list of tables has one per line."""
     if isinstance(value, dict):
-        return "{ " + ", ".join(f"{_toml(key)} = {_toml(one)}" for key, one in value.items()) + " }"
+        return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
     if isinstance(value, list | tuple) and value and isinstance(value[0], dict):
         return "[\n" + "".join(f"  {_toml(one)},\n" for one in value) + "]"
     return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")

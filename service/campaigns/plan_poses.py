@@ -1,0 +1,198 @@
+"""Plans the poses of an artefact for the minutes at hand: each next one tells the most, and all touches stay inside the strokes.
+
+The artefact file is TOML with one table ``[artefact.NAME]``, as at the end of a recipe.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from abbe.models.arrays import F2
+from abbe.models.planning.measurements import Instruments
+from abbe.models.planning.poses import plane_uncertainty_mm
+from abbe.models.planning.problem import PlanningProblem, problem
+from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
+from abbe.models.solvers.observability.poses import SHIFT, PoseRank, pose_rank
+from abbe.models.solvers.observations import RunData
+from abbe.service.config import read_toml
+from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject
+from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
+from abbe.service.domain.run import ArtefactSetup, Columns, Run, parsed_setup
+from abbe.service.errors import ConfigError, StrokeError
+from abbe.service.runs.artefact_points import artefact_data, calibrated_lengths
+from abbe.service.sequences.check import DryRun, dry_run
+from abbe.service.sequences.recipes.artefact import ArtefactTest
+from abbe.service.sequences.recipes.recipe_file import recipe_text
+from abbe.service.sequences.steps import TestPlan, TouchFeature
+from abbe.service.site import Site
+
+ORDER = 4
+"""Highest Legendre order of the planned map, as `pose_rank` counts its fields."""
+MOUNT_MIN = 8.0
+U_MM = 4e-4
+"""Repeatability of a found centre: assumed."""
+MARGIN_MM = 1.0
+NODES = 7
+COVERAGE = 2.0
+
+
+@dataclass(frozen=True, slots=True)
+class PlannedPose:
+    """A pose in order: its recipe and dry run, minutes with mounting, and what is known after it."""
+
+    recipe: ArtefactTest
+    dry: DryRun
+    minutes: float
+    until_min: float
+    rank: PoseRank | None
+    u_worst_mm: float
+    u_mean_mm: float
+
+
+@dataclass(frozen=True)
+class PosePlan:
+    """The poses in order, and the recipe file's text."""
+
+    poses: tuple[PlannedPose, ...]
+    text: str
+
+
+def read_artefact(path: Path) -> tuple[str, ArtefactObject]:
+    """Return name and description of the artefact in a file. Raises ConfigError with the first mistake."""
+    found = read_toml(path, "artefact file").get("artefact")
+    if not isinstance(found, dict) or len(found) != 1:
+        raise ConfigError(f"{path}: expected one table [artefact.NAME]", "docs/reference/recipe-file.md has an example")
+    ((name, doc),) = found.items()
+    try:
+        return str(name), ArtefactObject.read(doc)
+    except ValueError as error:
+        raise ConfigError(f"{path}: artefact.{name}: {' '.join(str(error).split())[:200]}", "correct it") from None
+
+
+def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, progress: ProgressSink = ignore_progress) -> PosePlan:
+    """Choose poses one after the other, by the fields that they show and then by U, until the minutes are used up.
+
+    Raises
+    ------
+    ConfigError
+        The artefact fits nowhere, a feature cannot be touched, or the minutes do not suffice for one pose.
+    """
+    offered = list(_offered(site, name, plate))
+    if not offered:
+        raise ConfigError(f"artefact {name}: no pose has all its touches inside the strokes", "use a smaller artefact")
+    what = problem(site.machine, Instruments(), ORDER)
+    points = _points(site, [plan for _, plan, _ in offered])
+    chosen, runs, used = list[PlannedPose](), list[Run](), 0.0
+    while True:
+        progress(Progress("plan", used, minutes, None, f"pose {len(chosen) + 1}"))
+        rest = [(r, plan, dry) for r, plan, dry in offered if used + MOUNT_MIN + dry.duration_s / 60.0 <= minutes]
+        if not rest:
+            break
+        tried = [(*_known(what, (*runs, _expected(site, plan)), points), r, plan, dry) for r, plan, dry in rest]
+        rank, worst, mean, recipe, _, dry = min(tried, key=lambda one: (-(one[0].rank if one[0] else 0), one[2]))
+        if chosen and mean > 0.98 * chosen[-1].u_mean_mm and (rank is None or chosen[-1].rank is None or rank.rank == chosen[-1].rank.rank):
+            break
+        label, cost = f"{name}-{len(chosen) + 1}", MOUNT_MIN + dry.duration_s / 60.0
+        used += cost
+        recipe = replace(recipe, label=label, setup_id=label)
+        runs.append(_expected(site, recipe.plan(site.machine)))
+        chosen.append(PlannedPose(recipe, dry, cost, used, rank, worst, mean))
+    if not chosen:
+        raise ConfigError(f"{minutes:g} minutes do not suffice for one pose of {name}", "give more --minutes")
+    note = f"for {site.name}, {used:.0f} minutes with mounting"
+    return PosePlan(tuple(chosen), recipe_text(f"{name} {used:.0f} min", tuple(p.recipe for p in chosen), note))
+
+
+def _offered(site: Site, name: str, plate: ArtefactObject) -> Iterator[tuple[ArtefactTest, TestPlan, DryRun]]:
+    """Poses at quarter turns, at the ends and in the middle of X and Y, and shifted by a part of a pitch; those inside the strokes."""
+    nominal = np.array([f.nominal_mm for f in plate.features])
+    pitch = float(np.median(np.sort(np.linalg.norm(nominal[:, None] - nominal[None], axis=2), axis=1)[:, 1])) if len(nominal) > 1 else 0.0
+    height = float(site.machine.stroke_mm[2].mean())
+    for turn in (0.0, 90.0, 180.0, 270.0):
+        one = ArtefactTest("pose", "pose", "identify", name, (0.0, 0.0, height), rotation_deg=(0.0, 0.0, turn), plate=plate)
+        reach = np.array([p for s in one.plan(site.machine).steps if isinstance(s, TouchFeature) for p in s.places_mm()])
+        low = site.machine.stroke_mm[:2, 0] - reach[:, :2].min(axis=0) + MARGIN_MM
+        high = site.machine.stroke_mm[:2, 1] - reach[:, :2].max(axis=0) - MARGIN_MM
+        steps = [sorted({a, 0.5 * (a + b), b, min(b, a + SHIFT * pitch)}) for a, b in zip(low, high, strict=True) if a <= b]
+        for x, y in ((x, y) for x in steps[0] for y in steps[1]) if len(steps) == 2 else ():
+            at = replace(one, origin_mm=(round(x, 2), round(y, 2), height))
+            try:
+                plan = at.plan(site.machine)
+                yield at, plan, dry_run(site.machine, plan)
+            except StrokeError:
+                continue
+
+
+def _points(site: Site, plans: list[TestPlan]) -> F2:
+    """Points over the part of the plane that the artefact can reach."""
+    reach = np.array([s.centre_mm for plan in plans for s in plan.steps if isinstance(s, TouchFeature)])
+    low, high = reach.min(axis=0), reach.max(axis=0)
+    x, y = np.meshgrid(np.linspace(low[0], high[0], NODES), np.linspace(low[1], high[1], NODES), indexing="ij")
+    return np.stack([x.ravel(), y.ravel(), np.full(x.size, reach[:, 2].mean())], axis=1)
+
+
+def _expected(site: Site, plan: TestPlan) -> Run:
+    """Return the run of a pose as a machine without errors would read it."""
+    touches = [s for s in plan.steps if isinstance(s, TouchFeature)]
+    doc: dict[str, Any] = {"t_s": [6.0 * k for k in range(len(touches))], "feature": [s.feature for s in touches]}
+    doc |= {f"{a}_mm": [s.centre_mm[k] for s in touches] for k, a in enumerate("xyz")}
+    doc |= {f"deviation_{a}_mm": [None if k == 2 and s.inside else 0.0 for s in touches] for k, a in enumerate("xyz")}
+    doc |= {"u_mm": [U_MM] * len(touches), "touch_start_deg": [s.start_deg for s in touches]}
+    setup = parsed_setup(ARTEFACT_TEST, plan.setup | {"t_set_s": 0.0})
+    run = Run(
+        campaign="plan", run_id=plan.label, test=ARTEFACT_TEST, role="identify", machine=site.doc, setup=setup,
+        columns=Columns.from_document(doc),
+    )  # fmt: skip
+    return run.with_artefact({"artefacts": plan.artefact})
+
+
+def _known(what: PlanningProblem, runs: tuple[Run, ...], points: F2) -> tuple[PoseRank | None, float, float]:
+    named = [_data(f"p{k}", run) for k, run in enumerate(runs)]
+    data = (*named, *calibrated_lengths(list(runs)))
+    return pose_rank(data), *plane_uncertainty_mm(what, data, points, DEFAULT_SIGMA_MM["artefact"])
+
+
+def _data(name: str, run: Run) -> RunData:
+    assert isinstance(run.setup, ArtefactSetup)
+    return replace(artefact_data(run, run.setup), label=name, setup=name)
+
+
+HEADINGS = ("no", "pose", "min", "until min", "fields", "worst U µm", "mean U µm")
+
+
+def pose_rows(plan: PosePlan) -> list[tuple[str, ...]]:
+    """Return a row for each pose: where, minutes, fields shown, U = 2 u afterwards, µm."""
+    rows: list[tuple[str, ...]] = []
+    for k, p in enumerate(plan.poses, start=1):
+        x, y, z = p.recipe.origin_mm
+        where = f"zero at X {x:g} Y {y:g} Z {z:g}, turned by {p.recipe.rotation_deg[2]:g}°"
+        fields = "" if p.rank is None else f"{p.rank.rank} of {p.rank.of}"
+        u = (f"{COVERAGE * p.u_worst_mm * 1e3:.3g}", f"{COVERAGE * p.u_mean_mm * 1e3:.3g}")
+        rows.append((str(k), where, f"{p.minutes:.1f}", f"{p.until_min:.1f}", fields, *u))
+    return rows
+
+
+def pose_doc(plan: PosePlan) -> dict[str, Any]:
+    """Return a plan as JSON object, in micrometres and minutes."""
+    return {
+        "poses": [
+            {
+                "label": p.recipe.label,
+                "origin_mm": list(p.recipe.origin_mm),
+                "rotation_deg": list(p.recipe.rotation_deg),
+                "minutes": p.minutes,
+                "until_min": p.until_min,
+                "machine_s": p.dry.duration_s,
+                "fields": None if p.rank is None else p.rank.rank,
+                "hidden": [] if p.rank is None else list(p.rank.hidden),
+                "u_worst_um": p.u_worst_mm * 1e3,
+                "u_mean_um": p.u_mean_mm * 1e3,
+            }
+            for p in plan.poses
+        ]
+    }
