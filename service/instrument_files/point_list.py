@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
+import scipy
 
 from abbe.models.arrays import F2
 from abbe.service.domain.artefact import ARTEFACT_TEST
@@ -166,7 +166,7 @@ def _vector(one: PointList, key: str, usual: str) -> list[float]:
 def _matrix(one: PointList) -> F2:
     turns = one.head.get("rotation_deg", "0").replace(",", " ").split()
     turns = ["0", "0", turns[0]] if len(turns) == 1 else turns
-    matrix: F2 = Rotation.from_euler("xyz", [float(v) for v in turns], degrees=True).as_matrix()
+    matrix: F2 = scipy.spatial.transform.Rotation.from_euler("xyz", [float(v) for v in turns], degrees=True).as_matrix()
     return np.round(matrix, 12) + 0.0
 
 

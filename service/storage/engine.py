@@ -22,6 +22,7 @@ from sqlalchemy.pool import StaticPool
 
 from abbe.service.errors import StoreError
 from abbe.service.secrets import mask_secrets
+from abbe.service.storage.journal_mode import wal_is_safe
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -68,15 +69,6 @@ BUSY_TIMEOUT_MS = 5000
 JOURNAL_LIMIT_BYTES = 64 * 2**20
 READ_ONLY_OPTION = "abbe_reads_only"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
-
-
-def wal_is_safe(version: str = sqlite3.sqlite_version) -> bool:
-    """Whether this SQLite version has the fix of the WAL-reset bug, which loses committed data (sqlite.org/wal.html).
-
-    Fixed in 3.51.3 and later, and in 3.44.6+ and 3.50.7+ of their branches.
-    """
-    number = tuple(int(part) for part in version.split("."))
-    return number >= (3, 51, 3) or (number[:2] == (3, 44) and number >= (3, 44, 6)) or (number[:2] == (3, 50) and number >= (3, 50, 7))
 
 
 def resolve_url(url: str, base: Path | None = None) -> str:

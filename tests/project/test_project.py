@@ -158,12 +158,30 @@ def test_no_source_file_is_longer_than_600_lines() -> None:
     assert long == {}
 
 
-def test_help_comes_at_once() -> None:
-    """What costs time at the start are the large libraries, and help needs none. Seconds would be those of a loaded computer."""
-    run = subprocess.run([sys.executable, "-X", "importtime", tool("abbe"), "--help"], cwd=ROOT, check=True, capture_output=True, text=True)
-    loaded = {line.rpartition("|")[2].strip().partition(".")[0] for line in run.stderr.splitlines() if line.startswith("import time:")}
+HEAVY = {"numpy", "scipy", "sqlalchemy", "alembic", "fastapi", "pymodbus", "serial", "aiomqtt", "structlog"}
+STARTS = {"--help": HEAVY | {"pydantic"}, "version": HEAVY, "device list": HEAVY}
+"""What a command must not import."""
+
+
+def modules(*words: str) -> set[str]:
+    """What a Python imports in whole, as `-X importtime` says."""
+    run = subprocess.run([sys.executable, "-X", "importtime", *words], cwd=ROOT, check=True, capture_output=True, text=True)
+    return {line.rpartition("|")[2].strip() for line in run.stderr.splitlines() if line.startswith("import time:")}
+
+
+@pytest.mark.parametrize("words", STARTS)
+def test_a_command_that_computes_nothing_comes_at_once(words: str) -> None:
+    """What costs time at the start are the large libraries. Seconds would be those of a loaded computer."""
+    loaded = {name.partition(".")[0] for name in modules(tool("abbe"), *words.split())}
     assert "typer" in loaded
-    assert not loaded & {"numpy", "scipy", "sqlalchemy", "alembic", "pydantic", "fastapi", "pymodbus", "serial", "aiomqtt", "structlog"}
+    assert not loaded & STARTS[words]
+
+
+def test_an_idle_service_holds_no_library_of_mathematics() -> None:
+    """Core and page import parts of scipy when they compute: 16 MB less in each."""
+    loaded = modules("-c", "import abbe.service.serve, abbe.service.web.app")
+    assert "abbe.service.web.app" in loaded
+    assert not {"scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special", "scipy.stats"} & loaded
 
 
 def test_every_row_of_what_you_own_names_a_test_that_exists() -> None:

@@ -11,8 +11,8 @@ from dataclasses import KW_ONLY, dataclass
 from typing import Annotated, Any, Literal
 
 import numpy as np
+import scipy
 from pydantic import Field as Limits
-from scipy.spatial.transform import Rotation
 
 from abbe.models.machine import Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject, Feature
@@ -53,7 +53,8 @@ class ArtefactTest(TestRecipe):
 
     def matrix(self) -> Array:
         """Columns: the artefact's axes in machine axes."""
-        found: Array = np.round(Rotation.from_euler("xyz", self.rotation_deg, degrees=True).as_matrix(), 12) + 0.0
+        turn = scipy.spatial.transform.Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
+        found: Array = np.round(turn.as_matrix(), 12) + 0.0
         return found
 
     def plan(self, machine: Machine) -> TestPlan:

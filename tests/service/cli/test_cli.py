@@ -14,7 +14,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service import cli
-from abbe.service.storage.engine import wal_is_safe
+from abbe.service.storage.journal_mode import wal_is_safe
 from abbe.service.storage.store import Store
 from tests.patience import within
 
