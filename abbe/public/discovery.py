@@ -13,7 +13,7 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare
 from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
-from abbe.service.discovery.discovery_text import unit
+from abbe.service.discovery.effect_pages import unit
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.effects.effect_catalogue import catalogue, checked

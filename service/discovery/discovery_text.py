@@ -7,26 +7,13 @@ import math
 from abbe.models.discovery.answer import Localization, NextTest
 from abbe.service.discovery.changed_text import changed_lines
 from abbe.service.discovery.discovery_states import LEFT, entering, judge, not_entered
+from abbe.service.discovery.effect_pages import ADDS, unit
 from abbe.service.discovery.never_fitted import disagreeing, nothing_missing
 from abbe.service.domain.discovery import Judgement
 from abbe.service.domain.finding import EffectFound, EffectSize, Finding, GapUm, ParameterFound
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain, with_uncertainty
 
-UNITS = {"um": "µm", "urad": "µrad", "": "", "1": "", "um/m": "µm/m"}
-ADDS = {
-    "second_feed": "the same path at a second feed",
-    "opposite_direction": "the same path in the other direction",
-    "second_radius": "a ball-bar of another length, or another centre",
-    "planar_circles": "ball-bar circles in the three planes",
-    "laser_diagonals": "laser step diagonals",
-    "ballbar": "ball-bar runs",
-    "single_axis_laser": "the laser along each axis",
-    "angular_interferometer": "an angular interferometer on the axis",
-    "second_tool_length": "the same runs with a second tool length",
-    "longer_session": "a repeat late in the session",
-    "reference_length": "a calibrated reference length",
-}
 AXES = "XYZ"
 MANY = 6
 CLEAR = 7.0
@@ -36,11 +23,6 @@ ROLES = {
     "holdout": "never fitted, only judge",
     "sealed": "predicted only",
 }
-
-
-def unit(text: str) -> str:
-    """Return a unit of the discovery format in its usual spelling: ``um/m`` as ``µm/m``."""
-    return UNITS.get(text, text)
 
 
 def size(effect: EffectSize) -> tuple[str, str, str]:

@@ -5,11 +5,30 @@ from __future__ import annotations
 from typing import Any
 
 from abbe.models.effects.effect import Effect
-from abbe.service.discovery.discovery_text import ADDS, unit
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.rendering.numbers import plain
 
+UNITS = {"um": "µm", "urad": "µrad", "": "", "1": "", "um/m": "µm/m"}
+ADDS = {
+    "second_feed": "the same path at a second feed",
+    "opposite_direction": "the same path in the other direction",
+    "second_radius": "a ball-bar of another length, or another centre",
+    "planar_circles": "ball-bar circles in the three planes",
+    "laser_diagonals": "laser step diagonals",
+    "ballbar": "ball-bar runs",
+    "single_axis_laser": "the laser along each axis",
+    "angular_interferometer": "an angular interferometer on the axis",
+    "second_tool_length": "the same runs with a second tool length",
+    "longer_session": "a repeat late in the session",
+    "reference_length": "a calibrated reference length",
+}
+
 HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")
+
+
+def unit(text: str) -> str:
+    """Return a unit of the discovery format in its usual spelling: ``um/m`` as ``µm/m``."""
+    return UNITS.get(text, text)
 
 
 def effect_row(effect: Effect) -> tuple[str, ...]:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,7 +21,9 @@ from abbe.service.domain.finding import EffectFound, EffectSize, Finding
 from abbe.service.domain.model_book import BookEffect, ModelBook, ModelVersion, Origin, Provenance
 from abbe.service.domain.results import ModelRecord, NewVersion
 from abbe.service.errors import ModelUnknown
-from abbe.service.storage.store import Store
+
+if TYPE_CHECKING:
+    from abbe.service.storage.store import Store
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 LASTING = ("drive", "structure", "geometry")

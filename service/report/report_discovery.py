@@ -22,10 +22,10 @@ from abbe.service.discovery.discovery_text import (
     parameter_text,
     rival_lines,
     size_text,
-    unit,
     unseen_lines,
     verdict_of,
 )
+from abbe.service.discovery.effect_pages import unit
 from abbe.service.domain.finding import EffectFound, Finding
 from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import REMEDIES

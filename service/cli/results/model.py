@@ -100,7 +100,7 @@ def diff_models(
     as_json: JsonOption = False,
 ) -> None:
     """Show the effects that were added, removed or resized between two versions."""
-    from abbe.service.discovery.discovery_text import unit
+    from abbe.service.discovery.effect_pages import unit
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import differences, version
     from abbe.service.rendering.numbers import with_uncertainty

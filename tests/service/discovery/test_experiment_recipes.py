@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
-from abbe.service.discovery.discovery_text import ADDS
+from abbe.service.discovery.effect_pages import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
