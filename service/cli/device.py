@@ -10,7 +10,7 @@ import typer
 
 from abbe.service.cli.common import JsonOption, answer, conclude, print_json, print_table
 
-device = typer.Typer(no_args_is_help=True, help="Test devices, list the device files that come with Abbe.")
+device = typer.Typer(no_args_is_help=True, help="Test devices and interferometers, list the device files that come with Abbe.")
 
 
 @device.command("list")
@@ -37,6 +37,27 @@ def show_file(
     wire = "modbus+tcp" if file.modbus is not None else "socket"
     answer({"name": name, "toml": (text := find(name).read_text(encoding="utf-8"))}, text.rstrip("\n"), as_json=as_json)
     conclude(f"abbe device test {quote(f'{wire}://HOST:PORT?device={name}')} --move 10", as_json=as_json)
+
+
+@device.command("interferometer")
+def interferometer(
+    file: Annotated[
+        Path, typer.Argument(metavar="FILE", help="Table with headings: signals, phase and radius, or position and deviation.")
+    ],
+    fringe: Annotated[
+        float, typer.Option(metavar="NM", min=1.0, help="Displacement per period of the signals, nm; 316.4: HeNe, single pass.")
+    ] = 316.4,
+    as_json: JsonOption = False,
+) -> None:
+    """Find the cyclic error of an interferometer (periodic nonlinearity), orders 1 and 2 per fringe with U, from its quadrature signals.
+
+    Or from a slow linear run whose position is known much better than a fringe. Samples stand in the order in which they were taken.
+    """
+    from abbe.service.instrument_files.interferometer import answer_doc, cyclic_error_of, lines_of
+
+    found = cyclic_error_of(file, fringe)
+    answer(answer_doc(found), *lines_of(found), as_json=as_json)
+    conclude("abbe effects cyclic_error", as_json=as_json)
 
 
 @device.command("test")

@@ -102,6 +102,7 @@ READS = frozenset(
         "effects",
         "errors",
         "check-config",
+        "device interferometer",
         "device list",
         "device show",
         "device test",

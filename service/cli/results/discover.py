@@ -54,6 +54,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
         machine = _checked_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
         if _standstill(found, plain=report is None and not live, as_json=as_json):
+            conclude(f"abbe {'report' if found.folder is None else 'import'} {quote(campaign)}", machine=machine, db=db, as_json=as_json)
             return
         job, journal = _started(found, store)
         finding = _searched(job, journal)

@@ -45,6 +45,7 @@ def test_days_of_a_standing_axis_show_its_thermal_response(abbe: Abbe) -> None:
     assert done.code == 0, done.err
     assert "campaign heat: 8 runs at standstill (ISO 230-3), temperatures ambient, spindle, bed" in done.out
     assert "Heat explains it in part." in done.out
+    assert done.err.endswith("next: abbe report heat\n")
     assert "shift of several runs: none that chance does not explain (p > 0.01)" in done.out
     doc = json.loads(abbe("discover", "heat", "--json").out)
     assert doc["rms_um"]["response"] < 0.5 * doc["rms_um"]["static"]
