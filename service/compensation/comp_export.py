@@ -39,6 +39,8 @@ from abbe.service.site import machine_from_doc, site_of
 from abbe.service.verification.reduction import UNKNOWN
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
+BEYOND = 0.1
+"""Share of a stroke beyond the positions of the runs from which an export says so."""
 ONLY_FRESH = "the tables assume that no table was active during the measurement: if one was, add it to them"
 
 
@@ -99,6 +101,19 @@ def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
     if without_scale:
         return [f"{text}: left out, and not corrected; {rest}"]
     return [f"{text}: written, but these runs hardly tell: ± {worst:.2g} µm with it, {rest}: --without-scale leaves it out"]
+
+
+def reach_note(doc: dict[str, Any]) -> list[str]:
+    """Say which ends of which axes no run reached, if these are more than a tenth of the stroke: there the tables are assumption."""
+    machine, notes = machine_from_doc(doc["machine"]), []
+    for (axis, (low, high)), (first, last) in zip(doc.get("reached_mm", {}).items(), machine.stroke_mm, strict=False):
+        beyond = max(low - first, last - high) / (last - first)
+        if beyond > BEYOND:
+            notes.append(
+                f"no run reached {axis} below {low:.0f} or above {high:.0f} mm of its stroke {first:.0f} to {last:.0f} mm: what the tables "
+                "correct there is assumed, not measured"
+            )
+    return notes
 
 
 def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:

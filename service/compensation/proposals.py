@@ -40,6 +40,7 @@ from abbe.service.identification.solve_tables import scale_free
 from abbe.service.identification.table_removal import CampaignTable
 from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest, reasons_against
 from abbe.service.runs.columns import load_run
+from abbe.service.runs.coverage import reached_mm
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, added, read_base, tables_from_image
@@ -97,16 +98,8 @@ def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
         mark_of(r.table.boot_id for r in used), known,
-        promise.last_s, _reached_mm(used),
+        promise.last_s, reached_mm(used),
     )  # fmt: skip
-
-
-def _reached_mm(runs: list[Run]) -> tuple[tuple[float, float], ...]:
-    """Lowest and highest position of each axis in these runs, mm."""
-    if not runs:
-        return ()
-    places = np.concatenate([r.columns.q_mm[r.columns.valid] for r in runs])
-    return tuple((float(low), float(high)) for low, high in zip(places.min(axis=0), places.max(axis=0), strict=True))
 
 
 def _instruments(runs: list[Run]) -> set[str]:

@@ -278,6 +278,9 @@ class SolutionFile(FileObject):
     mean_over_volume: dict[str, MeanValue]
     mean_over_volume_note: str
     holds_at: str | None = Field(default=None, description="scales' temperature at which solution and tables hold")
+    reached_mm: dict[str, tuple[float, float]] = Field(
+        default_factory=dict, description="lowest and highest position of each axis in the runs; the map beyond rests on the prior"
+    )
     motions: dict[str, MotionValue]
     rank: Rank
     rough: list[str] = Field(default_factory=list, description="which motions are rough, with length or period and remedy")

@@ -26,6 +26,7 @@ from abbe.service.campaign_data.provenance import measured_digest, removals_of
 from abbe.service.domain.run import Run
 from abbe.service.errors import CampaignRefused, InstrumentsDisagree, NotObservable
 from abbe.service.runs.artefact_points import calibrated_lengths
+from abbe.service.runs.coverage import reached_mm
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
 from abbe.service.verification.iso_report import laser_inputs
@@ -66,7 +67,8 @@ class Solved:
     ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
     ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
-    temperature of the scales at which the result holds, as text. ``inputs``: stated uncertainties that no reading shows.
+    temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs,
+    beyond which the map is the prior's. ``inputs``: stated uncertainties that no reading shows.
     """
 
     joint: JointSolution
@@ -79,6 +81,7 @@ class Solved:
     tables: dict[str, dict[str, Any]] = field(default_factory=dict)
     removed: tuple[str, ...] = ()
     holds_at: str = ""
+    reached_mm: tuple[tuple[float, float], ...] = ()
     inputs: StatedInputs = field(default_factory=StatedInputs)
 
 
@@ -136,7 +139,7 @@ def solve_runs(
     digests = {r.run_id: measured_digest(r) for r in used}
     tables = {r.run_id: r.table.document for r in used if r.table.crc is not None}
     rows, removed, held = value_rows(used, data), tuple(removals_of(used)), holds_at(used, site.materials)
-    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, rows, tables, removed, held, inputs)
+    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, rows, tables, removed, held, reached_mm(used), inputs)
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:

@@ -10,6 +10,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.compensation.additive import SCALE_NOTE, MeanParameter, mean_linear
 from abbe.models.geometry.volume import volume_frame, volume_grid
+from abbe.models.machine import AXES
 from abbe.models.solvers.assessment import Observability, observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.volume import GOOD, USABLE, Knowing, Number, observability_number, whole_volume
@@ -254,6 +255,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         },
         mean_over_volume={p.name: MeanValue(value=p.value, u=p.u) for p in found.mean},
         holds_at=found.solved.holds_at,
+        reached_mm=dict(zip(AXES, found.solved.reached_mm, strict=False)),
         mean_over_volume_note=f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}",
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
         rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),

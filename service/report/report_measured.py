@@ -32,7 +32,7 @@ from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
-from abbe.service.runs.coverage import about_axis, not_judged, path_axis
+from abbe.service.runs.coverage import about_axis, not_judged, path_axis, reached_mm, reached_text
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.iso_readings import approaches_of
 from abbe.service.verification.iso_report import UM, Evaluated, evaluate, positioning_rows
@@ -148,7 +148,14 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
     condition, remarks = parts.conditions(campaign.runs, rules)
     solved = _solution(found.solution)
     used = [run for run in campaign.runs if run.identifies]
-    holds = {} if found.solution is None else {"Solution holds at": holds_at(used, rules.materials)}
+    holds = (
+        {}
+        if found.solution is None
+        else {
+            "Solution holds at": holds_at(used, rules.materials),
+            "Measured positions": reached_text(dict(zip(AXES, reached_mm(used), strict=False))),
+        }
+    )
     remarks = [*found.table.remarks, *_unfinished(found.states, campaign.runs), *solved.remarks, *evaluated.remarks, *remarks]
     return Document(
         kind="campaign",

@@ -3,11 +3,13 @@
 A run that was stopped, aborted, interrupted or failed gives no result, and neither does one that has read less than `LEAST` of its path. A
 complete run with a few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
 
-Also the axis of a ball-bar path and the angle about it, for counting turns here and for drawing them in pages and the live view.
+Also the positions that runs reach, beyond which a map is assumed, and the axis of a ball-bar path with the angle about it, for counting
+turns here and for drawing them in pages and the live view.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -22,6 +24,21 @@ STRAIGHT = 0.8
 """Smallest ratio of net to total travel along the axis of a helix."""
 ROUND = 0.5
 """Largest ratio of net to total travel across the axis of a helix, which goes round. Less than a turn is not a helix."""
+
+
+def reached_mm(runs: Sequence[Run]) -> tuple[tuple[float, float], ...]:
+    """Return the lowest and highest position of each axis in the valid readings of these runs, mm; empty without any."""
+    places = [r.columns.q_mm[r.columns.valid] for r in runs]
+    if not sum(map(len, places)):
+        return ()
+    ends = np.concatenate(places)
+    return tuple((float(low), float(high)) for low, high in zip(ends.min(axis=0), ends.max(axis=0), strict=True))
+
+
+def reached_text(reached: Mapping[str, tuple[float, float]]) -> str:
+    """Return the positions that runs reach as text; empty if they are not known."""
+    ends = ", ".join(f"{axis} {low:.0f} to {high:.0f}" for axis, (low, high) in reached.items())
+    return f"{ends} mm, beyond it is assumed" if ends else ""
 
 
 def helix_axis(stated: str, at_mm: F2) -> int | None:

@@ -40,7 +40,7 @@ def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
         f"campaign {solution.campaign}: model {solution.model}, {len(solution.runs)} runs; the readings determine {o.rank} "
         f"of {len(o.terms)} coefficients, {o.observed.effective_rank} of them well"
     )
-    lines += [worst_line(summary), f"largest errors (U, k = 2): {_largest(summary)}", f"holds at: {solution.holds_at}"]
+    lines += [worst_line(summary), f"largest errors (U, k = 2): {_largest(summary)}", _holds(solution)]
     against = {
         "look at these runs": solution.flags,
         "rough": solution.rough,
@@ -56,6 +56,14 @@ def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
         same = ", ".join(map(str, solution.same_as or ()))
         lines.append(f"stored: solution {solution.solution_id}" + (f", the same readings and model as solution {same}" if same else ""))
     return lines
+
+
+def _holds(solution: SolutionFile) -> str:
+    """Say at which temperature the solution holds, and between which positions the runs measured."""
+    from abbe.service.runs.coverage import reached_text
+
+    reached = reached_text(solution.reached_mm)
+    return f"holds at: {solution.holds_at}" + (f"; measured: {reached}" if reached else "")
 
 
 def _first(found: list[str]) -> str:

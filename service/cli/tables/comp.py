@@ -99,6 +99,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         export,
         formats_in,
         identified,
+        reach_note,
         reference_of,
         scale_note,
         sign_files,
@@ -115,7 +116,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     made = export(
         known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN, turned=sign_is_turned(step_moved)
     )
-    notes = [*made.notes, *scale_note(doc, without_scale=without_scale)]
+    notes = [*made.notes, *scale_note(doc, without_scale=without_scale), *reach_note(doc)]
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:
         written.append(str(sign_files(out, form, config, seal, SystemClock().utc())))

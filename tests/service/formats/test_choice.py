@@ -14,7 +14,7 @@ from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import Machine
 from abbe.service.cli import run
-from abbe.service.compensation.comp_export import export, identified
+from abbe.service.compensation.comp_export import export, identified, reach_note
 from abbe.service.formats.controls import CONTROLS, FormatJudge, best_of, choices
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import AxisTable, Compensation, correction_at
@@ -106,6 +106,21 @@ def test_control_without_columns_is_told_its_backlash() -> None:
     assert any("X 4.00 µm, Y 6.00 µm, Z -2.00 µm" in note for note in made.notes)
     assert made.notes[0] == "holds at: unknown: no temperature of the scales is on record or stated"
     assert {f.name for f in made.files} == {"AX_EEC.INI", "NC_CEC.INI"}
+
+
+@pytest.mark.parametrize(
+    ("reached", "said"),
+    [
+        ({"X": (0.0, 500.0), "Y": (-200.0, 165.0), "Z": (-300.0, 0.0)}, []),
+        ({"X": (20.0, 430.0), "Y": (-200.0, 200.0), "Z": (-300.0, 0.0)}, ["X below 20 or above 430 mm of its stroke 0 to 500 mm"]),
+        ({}, []),
+    ],
+    ids=["nearly all", "an end of X is missing", "not known"],
+)
+def test_what_no_run_reached_is_said_with_the_tables(reached: dict[str, tuple[float, float]], said: list[str]) -> None:
+    notes = reach_note(_document(_known()) | {"reached_mm": reached})
+    assert len(notes) == len(said)
+    assert all(text in note for text, note in zip(said, notes, strict=True))
 
 
 def test_cross_tables_looked_up_at_the_corrected_position() -> None:
