@@ -84,6 +84,19 @@ class DiscoveryJob:
         return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
+def _without_artefacts(campaign: Campaign) -> tuple[Campaign, list[str]]:
+    """Leave out points of artefacts: what moves with a part, and what stays with the machine, is named by a solution of its poses."""
+    artefacts = [r.run_id for r in campaign.runs if r.is_artefact]
+    if not artefacts:
+        return campaign, []
+    if len(artefacts) == len(campaign.runs):
+        raise NotObservable(
+            f"campaign {campaign.name} has only points of artefacts, which the search does not read",
+            f"`abbe solve {campaign.name}` names what moves with the part, screws and false triggers; discover with ball-bar or laser runs",
+        )
+    return campaign.without(artefacts), [f"points of artefacts were left out of the search: {', '.join(artefacts)}"]
+
+
 def prepare(
     campaign: Campaign,
     effects: tuple[Effect, ...],
@@ -111,11 +124,12 @@ def prepare(
     CampaignRefused
         The data of a run contradict its description.
     NotObservable
-        No run has the role identify.
+        No run has the role identify, or all are points of artefacts.
     ModelUnknown
         The book contains an effect that is not in the catalogue.
     """
-    flags = _checked(campaign)
+    campaign, flags = _without_artefacts(campaign)
+    flags += _checked(campaign)
     left = remove_table(campaign, table.table)
     flags += [table_line(left.removed)] if left.removed is not None else [table.why] if table.why else []
     runs = thin(left.runs)

@@ -34,6 +34,7 @@ from abbe.service.errors import CampaignRefused, NotObservable, StoreError, Unus
 from abbe.service.rendering.document_data import shown
 from abbe.service.report.report_discovery import found_report, gap_table
 from abbe.service.storage.store import Store
+from tests.artefact_campaign import campaign as artefact_campaign
 from tests.service.discovery.discovery_bench import Search, write_case
 
 ALL = ["FITTED", "SUSPICIOUS", "PROPOSED", "TESTING", "EXPLAINED"]
@@ -441,6 +442,11 @@ def test_a_finding_comes_back_from_json_as_it_was(folder: Path, search: Search) 
     finding = discover(job_of(folder), DiscoveryJournal(), search, ignore_progress)
     text = json.dumps(document(finding), allow_nan=False)
     assert record(Finding, json.loads(text), "a finding") == finding
+
+
+def test_points_of_artefacts_are_not_searched(tmp_path: Path) -> None:
+    with pytest.raises(NotObservable, match=r"only points of artefacts.*`abbe solve plate` names what moves with the part"):
+        job_of(artefact_campaign(tmp_path))
 
 
 def test_a_stored_document_of_another_form_is_refused_with_its_place() -> None:
