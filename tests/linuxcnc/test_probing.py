@@ -1,0 +1,163 @@
+"""A plate probed by a real LinuxCNC: recipe, G38.3, solution, tables, and another pose before and after.
+
+The contact is simulated in the control's servo thread (contact.hal): the stylus is deflected when the tool, where the drives put it plus a
+known error of the machine, leaves a hole. The servo period makes each touch coarse: at 2 mm/s it is two micrometres.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import sys
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from abbe.models.compensation.tables import quantise
+from abbe.models.machine import Machine
+from abbe.service.campaign_data.campaign_folder import from_store
+from abbe.service.campaigns.measure import measure
+from abbe.service.compensation.commission_levels import commission_levels
+from abbe.service.compensation.proposals import change_of
+from abbe.service.devices.session import DeviceUrls, Session
+from abbe.service.domain.artefact import ArtefactObject
+from abbe.service.errors import MissedContact
+from abbe.service.identification.solve import solve_runs
+from abbe.service.sequences.control import Watching
+from abbe.service.sequences.recipes.artefact import ArtefactTest
+from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.site import Site, machine_doc
+from abbe.service.storage.store import Store
+from abbe.service.verification.verify import pose_figures
+from tests.linuxcnc.instance import Instance
+from tests.linuxcnc.test_control import bring, controller
+from tests.patience import within
+
+HERE = Path(__file__).parent
+MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]), np.zeros((3, 3)), np.array([0.0, 0.0, -120.0]))
+FIELD = (-90e-6, 60e-6, -40e-6, 0.0, 0.0)
+"""Of contact.py: scales and squareness, some 10 um over the plane; more would need more holes, and each takes seconds."""
+PITCH_MM, ROWS = 70.0, 3
+FORM = 0.005 * np.random.default_rng(3).standard_normal((ROWS * ROWS, 2))
+POSES = (((150.0, 120.0), 0), ((420.0, 130.0), 1))
+CHECK = (((400.0, 330.0), 2),)
+
+
+def nominal() -> np.ndarray:
+    return np.array([[i % ROWS * PITCH_MM, i // ROWS * PITCH_MM] for i in range(ROWS * ROWS)])
+
+
+def plate() -> ArtefactObject:
+    ids = [f"{'ABC'[i % ROWS]}{i // ROWS + 1}" for i in range(ROWS * ROWS)]
+    features = [
+        {"id": name, "nominal_mm": [*map(float, p), 0.0], "sensed": "xy", "radius_mm": 10.0} for name, p in zip(ids, nominal(), strict=True)
+    ]
+    true = nominal() + FORM
+    length = float(np.linalg.norm(true[ROWS - 1] - true[0]))
+    known = [{"from": "A1", "to": "C1", "length_mm": length, "U_mm": 0.0004, "k": 2}]
+    return ArtefactObject.read({"kind": "hole_plate", "features": features, "calibrated_lengths": known})
+
+
+class Hands:
+    """A fixture without hands: it only tells contact.py where the holes are now."""
+
+    name = "hands"
+
+    def __init__(self, machine: Instance, reach_mm: float) -> None:
+        self._machine, self._reach_mm = machine, reach_mm
+        self.contact: asyncio.subprocess.Process | None = None
+
+    async def identify(self) -> str:
+        return self.name
+
+    async def mount_artefact(self, origin_mm: Any, matrix: Any) -> None:
+        await self.unmount()
+        turn = np.array(matrix)[:2, :2]
+        holes = np.array(origin_mm[:2]) + [0.02, -0.01] + (nominal() + FORM) @ turn.T
+        given = json.dumps({"holes": holes.tolist(), "field": FIELD, "reach_mm": self._reach_mm})
+        code = (HERE / "contact.py").read_text()
+        self.contact = await asyncio.create_subprocess_exec(
+            *self._machine.inside("/usr/bin/python3", "-c", code, given), stdin=asyncio.subprocess.PIPE, stdout=asyncio.subprocess.PIPE
+        )
+        assert self.contact.stdout is not None
+        assert await self.contact.stdout.readline() == b"ready\n"
+
+    async def unmount(self) -> None:
+        if self.contact is not None:
+            await self.contact.communicate(b"")  # its input ends
+            self.contact = None
+            self._machine.halcmd("setp", "contact-reach.in0", "1000.0")
+
+    async def close(self) -> None:
+        await self.unmount()
+
+
+@asynccontextmanager
+async def probing(machine: Instance, reach_mm: float = 7.0) -> AsyncIterator[tuple[Session, Site]]:
+    hands = Hands(machine, reach_mm)
+    site = Site(
+        "control",
+        MACHINE,
+        machine_doc("control", MACHINE),
+        DeviceUrls(cnc=f"modbus+tcp://127.0.0.1:{machine.port}"),
+        watching=Watching(unknown_s=within(20.0)),
+    )
+    try:
+        async with controller(machine) as cnc:
+            await cnc.identify()
+            yield Session(controller=cnc, ballbar=None, laser=None, fixture=hands), site  # type: ignore[arg-type]
+    except Exception as error:
+        error.add_note(machine.logs())
+        raise
+    finally:
+        await hands.close()
+
+
+def poses(name: str, where: Any, role: str) -> CampaignPlan:
+    quick = {"search_mm": 0.12, "feed_mm_min": 6_000.0, "touch_feed_mm_min": 120.0, "clear_mm": 5.0, "turned_every": 0}
+    tests = [
+        ArtefactTest(
+            f"{name}-{k}", f"{name}-{k}", role, "plate", (*at, 200.0), rotation_deg=(0.0, 0.0, 90.0 * turn), plate=plate(), **quick
+        )
+        for k, (at, turn) in enumerate(where)
+    ]
+    return CampaignPlan(name, tuple(t.plan(MACHINE) for t in tests))
+
+
+@pytest.mark.timeout(600)
+async def test_a_plate_maps_corrects_and_verifies_the_plane(instances, tmp_path):
+    machine = instances()
+    (machine.run / "drives.hal").write_text((HERE / "contact.hal").read_text())
+    machine.faster(2000, 100_000)
+    await machine.start()
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        async with probing(machine) as (session, site):
+            await commission_levels(session.controller, store, site)
+            await measure(session, store, site, poses("plate", POSES, "identify"))
+            await measure(session, store, site, poses("before", CHECK, "holdout"))
+            solved = solve_runs(site, from_store(store, "plate").runs, model=None)
+            change, promised, _ = change_of(solved)
+            await bring(session.controller, store, site, quantise(change, 1e-4))  # type: ignore[arg-type]
+            await measure(session, store, site, poses("after", CHECK, "holdout"))
+        before, after = (pose_figures(from_store(store, name).runs, solved.joint).worst for name in ("before", "after"))
+        figures = f"rms um: before {1e3 * before.value_mm:.2f}, after {1e3 * after.value_mm:.2f}, promised {promised}"
+        sys.stderr.write(figures + "\n")
+        assert before.value_mm > 0.003
+        assert after.value_mm < 0.4 * before.value_mm, figures
+
+
+@pytest.mark.timeout(300)
+async def test_a_missed_contact_names_its_feature(instances, tmp_path):
+    machine = instances()
+    (machine.run / "drives.hal").write_text((HERE / "contact.hal").read_text())
+    await machine.start()
+    with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
+        async with probing(machine, reach_mm=9.0) as (session, site):
+            with pytest.raises(MissedContact, match="feature A1"):
+                await measure(session, store, site, poses("plate", POSES[:1], "identify"))
+        (run,) = store.runs.all()
+        assert run.reason.startswith("PRB-002")
