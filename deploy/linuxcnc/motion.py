@@ -173,7 +173,7 @@ class Motion:
             return Result.BAD_ARGUMENT
         self._begin(_Pending(target_mm, is_path=False, points=0, is_touch=True))
         x, y, z = (t - o for t, o in zip(target_mm, zero, strict=True))
-        self._control.mdi(f"{_MODES} G61 G38.3 X{x:.5f} Y{y:.5f} Z{z:.5f} F{feed_mm_min:.2f}")
+        self._control.mdi(f"{_MODES} G61 G38.3 X{x:.9f} Y{y:.9f} Z{z:.9f} F{feed_mm_min:.2f}")
         return Result.OK
 
     def path_clear(self) -> Result:

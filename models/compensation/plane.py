@@ -1,6 +1,7 @@
 """One-axis tables from a deviation that is known in a part of one plane only: there the two axes of the plane correct each other.
 
-Beyond the known part the tables hold their end values, so that nothing is assumed there; the third axis is neither moved nor corrected.
+Beyond the known part the tables hold their end values: there, and at every other position of the third axis, they are assumed. The third
+axis is neither moved nor corrected.
 """
 
 from __future__ import annotations

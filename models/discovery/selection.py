@@ -264,8 +264,7 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
         elif new is not None:
             picks.append(new.pick)
             picks = dropped(contest, joined(contest, swapped(contest, picks)))
-            if new.pick.label not in {p.label for p in picks}:
-                in_vain.append(new.pick.label)
+            in_vain = [*in_vain, new.pick.label] if new.pick.label not in {p.label for p in picks} else []
         else:
             break
     return weighed(contest, dropped(contest, picks))

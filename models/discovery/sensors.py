@@ -42,8 +42,8 @@ def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values)
 
 
 def _alike(course: F1, paths: Sequence[Path], sensor: str) -> float:
-    """Correlation of a warm-up with the mean temperature of every run; 0 for a constant temperature."""
+    """Correlation of a warm-up with the mean temperature of every run; 0 for a constant or missing temperature."""
     mean = np.array([p.at.temp_c[sensor].mean() for p in paths])
-    if np.ptp(mean) == 0.0 or np.ptp(course) == 0.0:
+    if not np.isfinite(mean).all() or np.ptp(mean) == 0.0 or np.ptp(course) == 0.0:
         return 0.0
     return float(np.corrcoef(course, mean)[0, 1])

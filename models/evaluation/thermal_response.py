@@ -131,8 +131,10 @@ class ThermalResponse:
 
     @property
     def time_constant_s(self) -> tuple[float, float]:
-        """Time constant and its standard uncertainty, s."""
-        return self._averaged(np.array([f.time_constant_s for f in self.fits]), np.zeros(len(self.fits)))
+        """Time constant and its standard uncertainty, s, which includes the grid of time constants that are tried."""
+        tried = np.array([f.time_constant_s for f in self.fits])
+        steps = np.interp(tried, TIME_CONSTANTS_S, np.gradient(np.array(TIME_CONSTANTS_S)))
+        return self._averaged(tried, steps**2 / 12.0)
 
     def _averaged(self, means: F1, variances: F1) -> tuple[float, float]:
         mean = float(self.weights @ means)

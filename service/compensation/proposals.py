@@ -285,14 +285,17 @@ def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTable
 
 
 def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, ...]]:
-    """Return tables of the plane in which artefacts lay; they do not act beyond the touched positions.
+    """Return tables of the plane in which artefacts lay; beyond the touched positions they hold their end values.
 
     Raises
     ------
     TableRefused
-        The solution has a fault that nobody looked at, or all three directions were sensed.
+        The solution put a fault right that nobody looked at, or all three directions were sensed.
     """
     joint = solved.joint
+    if solved.undone:
+        fault = solved.undone[0]
+        raise TableRefused(f"run {fault.run}: {fault.what} ({fault.done})", "look at the artefact and measure that pose again")
     if unsensed_axis(joint) is None:
         raise TableRefused("these artefacts span a volume: one-axis tables are made of one plane", "make a grid: abbe solve --tables")
     frame: list[str] = []
@@ -303,7 +306,7 @@ def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, 
         return value, 0.5 * expanded
 
     change, predicted = plane_tables(joint.machine, touched_box_mm(joint), known, GRID)
-    return change, predicted, (f"in the plane and part of the strokes where the artefact lay only; {frame[0]}",)
+    return change, predicted, (f"known in the plane and part of the strokes where the artefact lay only, assumed elsewhere; {frame[0]}",)
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:

@@ -8,7 +8,7 @@ the tables (`abbe comp commission`), the laser only tells the temperature.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +19,7 @@ from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.correct import Correction, correct
 from abbe.service.compensation.gate import PushContext
-from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
+from abbe.service.demo.demo import FIRST_TABLE_LIMITS, bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.artefact import ArtefactObject
@@ -77,7 +77,8 @@ async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: Pro
     clock = clock or SystemClock()
     start, args = clock.monotonic_s(), ["--seed", str(seed)]
     async with running_simulators([*args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
-        site = demo_site(simulator.ready)
+        # one plane is measured, and the tables act at every height: the person who starts this demonstration takes that on
+        site = replace(demo_site(simulator.ready), limits=replace(FIRST_TABLE_LIMITS, beyond=1.0))
         write_machine_file(site, folder)
         result = ArtefactDemo(seed, site, folder, clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")

@@ -26,6 +26,8 @@ VISIBLE = 1.05
 """Smallest ratio of gap to noise floor, without the effect, at which holdout runs can judge; below it they do not show the effect."""
 CLOSED = 0.5
 """Share of the gap (`GapUm.closed`) that must close on the holdout runs. A wrong effect closes it on the fitted runs only."""
+SOME = 0.2
+"""A smaller share of the gap also closes by chance."""
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise. Less of a gap than this may also be the
 prediction's own error, so what remains of it refutes no effect with which the holdout runs agree better."""
@@ -138,7 +140,7 @@ def _judged(finding: Finding, *, moving: bool) -> Judgement:
     if not moving:
         rule = "an effect that only adds scatter closes no gap: judged by evidence alone"
         return Judgement(rule=rule, proved=None, closed=share, gap=gap)
-    if share < CLOSED and gap.after_um < min(gap.before_um, LEFT * gap.floor_um):
+    if SOME <= share < CLOSED and gap.after_um < LEFT * gap.floor_um:
         return Judgement(
             rule="the holdout runs agree better with the effect, but show too little of the gap", proved=None, closed=share, gap=gap
         )

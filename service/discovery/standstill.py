@@ -118,19 +118,21 @@ def lines_of(answer: StandstillAnswer) -> list[str]:
 
 
 def _shift_lines(answer: StandstillAnswer) -> list[str]:
-    found = ((answer.found.shift_absolute, "temperatures as they are"), (answer.found.shift_since_start, "changes of temperature"))
-    shifts = [_shift_line(answer.runs, shift, what) for shift, what in found if shift is not None]
+    better = "look for what changed there (coolant, mounting, sensor)"
+    worse = "this model predicts worse than the other; runs that begin warmer or colder than the rest also look like this"
+    found = (
+        (answer.found.shift_absolute, "temperatures as they are", worse if answer.found.since_start else better),
+        (answer.found.shift_since_start, "changes of temperature", better if answer.found.since_start else worse),
+    )
+    shifts = [_shift_line(answer.runs, shift, what, then) for shift, what, then in found if shift is not None]
     return shifts or [f"shift of several runs: none that chance does not explain (p > {CHANCE:g})"]
 
 
-def _shift_line(runs: Sequence[str], shift: Shift, what: str) -> str:
+def _shift_line(runs: Sequence[str], shift: Shift, what: str, then: str) -> str:
     size = " ± ".join(with_uncertainty(shift.size_mm * 1e3, shift.u_mm * 1e3))
     sign = "+" if shift.size_mm > 0.0 else ""
     where = f"from run {runs[shift.first]} " + ("on" if shift.last == len(runs) - 1 else f"to run {runs[shift.last]}")
-    return (
-        f"shift: {where} the displacement is {sign}{size} µm off what {what} explain (p = {plain(shift.p, 1)}): "
-        "look for what changed there (coolant, mounting, sensor)"
-    )
+    return f"shift: {where} the displacement is {sign}{size} µm off what {what} explain (p = {plain(shift.p, 1)}): {then}"
 
 
 def answer_doc(answer: StandstillAnswer) -> dict[str, Any]:

@@ -69,6 +69,7 @@ class Solved:
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
     temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs,
     beyond which the map is the prior's. ``inputs``: stated uncertainties that no reading shows.
+    ``undone``: faults of runs of artefacts (exchanged features, a turn, a motion) that the solution has put right by itself.
     """
 
     joint: JointSolution
@@ -83,6 +84,7 @@ class Solved:
     holds_at: str = ""
     reached_mm: tuple[tuple[float, float], ...] = ()
     inputs: StatedInputs = field(default_factory=StatedInputs)
+    undone: tuple[ArtefactFault, ...] = ()
 
 
 def solve_runs(
@@ -139,7 +141,21 @@ def solve_runs(
     digests = {r.run_id: measured_digest(r) for r in used}
     tables = {r.run_id: r.table.document for r in used if r.table.crc is not None}
     rows, removed, held = value_rows(used, data), tuple(removals_of(used)), holds_at(used, site.materials)
-    return Solved(joint, helices, step_diagonals(used), noise, tuple(flags), digests, rows, tables, removed, held, reached_mm(used), inputs)
+    return Solved(
+        joint,
+        helices,
+        step_diagonals(used),
+        noise,
+        tuple(flags),
+        digests,
+        rows,
+        tables,
+        removed,
+        held,
+        reached_mm(used),
+        inputs,
+        tuple(faults),
+    )
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:

@@ -70,7 +70,8 @@ def _place(headings: list[str], word: str) -> int | None:
 
 def _unit(heading: str, usual: str) -> float:
     """Factor of the unit in a heading, such as ``position (mm)`` or ``deviation_um``."""
-    return UNITS[next((word for word in re.findall(r"[a-z]+", heading)[1:] if word in UNITS), usual)]
+    words = re.findall(r"[a-z]+", heading.replace("µ", "u").replace("μ", "u"))
+    return UNITS[next((word for word in words[1:] if word in UNITS), usual)]
 
 
 def lines_of(found: CyclicError) -> list[str]:

@@ -218,23 +218,19 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
 
 
 def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Yield the reason for each axis of which the table corrects much that no run reached: there the map is only assumed."""
+    """Yield the reason for each axis of which the table covers much that no run reached: there the map is only assumed.
+
+    The whole grid counts, also where a correction stands still: the tables of one axis act at every position of the others.
+    """
     for axis, (low, high) in zip(AXES, c.evidence.reached_mm, strict=False):
-        acts = _acting(axis, c.columns)
+        grids = [column.position_mm for column in c.columns if column.moved == axis and column.position_mm]
         travel = context.travel_mm[axis][1] - context.travel_mm[axis][0]
-        beyond = max(low - acts[0], acts[1] - high) / travel if acts is not None else 0.0
+        beyond = max((max(low - grid[0], grid[-1] - high) / travel for grid in grids), default=0.0)
         if not beyond <= limits.beyond:
             yield (
                 f"REACH: the runs moved {axis} from {low:.0f} to {high:.0f} mm, the table corrects {beyond:.0%} of the stroke beyond, "
                 f"allowed are {limits.beyond:.0%} ([limits] table_beyond_percent)"
             )
-
-
-def _acting(axis: str, columns: Sequence[Column]) -> tuple[float, float] | None:
-    """Return the positions of an axis between which its tables change; None if they do not. Held end values assume nothing."""
-    mine = [column for column in columns if column.moved == axis]
-    ends = [k for column in mine for k, (a, b) in enumerate(pairwise(column.correction_mm)) if a != b]
-    return (mine[0].position_mm[min(ends)], mine[0].position_mm[max(ends) + 1]) if ends else None
 
 
 def drift_reason(drift_mm: float, limits: PushLimits) -> str:

@@ -1,16 +1,17 @@
 """Touches one feature of an artefact: protected way there, approach, touch, retract, repeats, and back above it.
 
-Every way between the artefact's features is a touch command, too, so that an unexpected contact stops the axes. Whatever goes wrong with
-the probe, the stylus is taken out first, the way it came.
+Every way between the artefact's features is a touch command, too, so that an unexpected contact stops the axes. After a missed contact,
+false trips or a stylus that stays deflected, the stylus is taken out first, the way it came.
 """
 
 from __future__ import annotations
 
+import asyncio
 import math
 from dataclasses import dataclass, field
 from typing import Any
 
-from abbe.drivers.api import Latch, Point, Probing, can_touch
+from abbe.drivers.api import Latch, Motion, Point, Probing, can_touch
 from abbe.service.errors import ConfigError, FalseTrips, MissedContact, Obstructed, ProbeNotReady, ProbeUncalibrated, SetupDisturbed
 from abbe.service.runs.touches import found_feature
 from abbe.service.sequences.steps import TouchFeature
@@ -23,6 +24,8 @@ RADIUS_MM = 0.05
 MOVED_MM = 0.01
 """Allowed change of a feature that is touched again: minutes of drift, but no plate that has slipped."""
 TOUCH_S = 30.0
+RESEAT_S, POLL_S = 1.0, 0.02
+"""How long a stylus may take to come back to rest after a touch (receivers report it late), and how often this is asked."""
 SAME_PLACE_MM = 1e-5
 
 
@@ -31,6 +34,33 @@ def need_probe(controller: object) -> Probing:
     if not can_touch(controller):
         raise ConfigError("this control cannot touch: its driver knows no probe input", "find the points there, and use `abbe import`")
     return controller
+
+
+async def guarded_move(controller: Motion, target: Point, *, feed_mm_min: float, timeout_s: float) -> None:
+    """Move; with a probe fitted as a touch command, because an abort may have left the stylus in a hole or beside a ball.
+
+    Raises
+    ------
+    ProbeNotReady, Obstructed
+        The stylus is deflected before the move, or met something on the way; the axes then backed off.
+    """
+    state = await controller.probe_state() if can_touch(controller) else None
+    if state is None or not state.fitted:
+        await controller.move(target, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
+        return
+    if state.deflected:
+        raise ProbeNotReady("the stylus is deflected before the first move", "free it by hand, away from the artefact; then start again")
+    probe = need_probe(controller)
+    start = (await probe.status()).position_mm
+    latch = await probe.touch(target, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
+    if latch is None:
+        return
+    await probe.move(start, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
+    x, y, z = latch.position_mm
+    raise Obstructed(
+        f"the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way to where the artefact is mounted",
+        "the axes backed off; jog the stylus clear of everything, then start again",
+    )
 
 
 @dataclass
@@ -149,7 +179,22 @@ class FeatureTouch:
             "is the artefact as stated (turned by 90 degrees, another, a clamp in the way)? the axes backed off; correct it, then resume",
         )
 
+    async def _free(self) -> None:
+        """Wait until the stylus is at rest. One that stays deflected is taken out by plain moves: no touch command works then."""
+        for _ in range(round(RESEAT_S / POLL_S)):
+            if not (await self.probe.probe_state()).deflected:
+                return
+            await asyncio.sleep(POLL_S)
+        way, self.out = self.out[::-1][1:], []
+        for place in way:
+            await self._move(place)
+        raise ProbeNotReady(
+            f"feature {self.step.feature}: the stylus stays deflected {RESEAT_S:g} s after a touch",
+            "look at the stylus, at its seat and at the probe's receiver; then resume",
+        )
+
     async def _touch(self, target: Point, feed_mm_min: float) -> Latch | None:
+        await self._free()
         return await self.probe.touch(target, feed_mm_min=feed_mm_min, timeout_s=TOUCH_S + self._seconds(feed_mm_min))
 
     async def _move(self, target: Point) -> None:

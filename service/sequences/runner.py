@@ -16,7 +16,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import AT_WORK, PAUSED, Control, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
-from abbe.service.sequences.probing import FeatureTouch, check_unmoved, need_probe
+from abbe.service.sequences.probing import FeatureTouch, check_unmoved, guarded_move, need_probe
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -290,8 +290,8 @@ class Runner:
 
     async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
         match step:
-            case MoveTo(target, feed):
-                await self._move(target, feed, here)
+            case MoveTo(target, feed, guarded):
+                await self._move(target, feed, here, guarded=guarded)
             case ZeroLaser():
                 self.records = []
                 await self._zeroed()
@@ -345,8 +345,12 @@ class Runner:
         await recorder.add_record(record)
         self.records.append(record)
 
-    async def _move(self, target: Point, feed_mm_min: float, here: Point | None) -> None:
+    async def _move(self, target: Point, feed_mm_min: float, here: Point | None, *, guarded: bool = False) -> None:
         seconds = 60.0 if here is None else math.dist(here, target) / feed_mm_min * 60.0
+        if guarded:
+            await guarded_move(self._s.controller, target, feed_mm_min=feed_mm_min, timeout_s=30.0 + 3.0 * seconds)
+            check_interlocks(await self._s.controller.status())
+            return
         status = await self._s.controller.move(target, feed_mm_min=feed_mm_min, timeout_s=30.0 + 3.0 * seconds)
         check_interlocks(status)
 

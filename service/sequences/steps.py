@@ -13,10 +13,11 @@ MAX_PATH_POINTS = 8192
 
 @dataclass(frozen=True, slots=True)
 class MoveTo:
-    """Straight move to commanded coordinates."""
+    """Straight move to commanded coordinates. ``guarded``: as a touch command if a probe is fitted, so that a contact stops the axes."""
 
     target_mm: Point
     feed_mm_min: float
+    guarded: bool = False
 
 
 @dataclass(frozen=True, slots=True)

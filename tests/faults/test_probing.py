@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -171,10 +172,10 @@ async def test_stopped_and_resumed_it_goes_on_at_the_feature(place):
     assert len(touched) < 3.5 * 16, "the first feature, the third and the first one again"
 
 
-async def test_aborted_in_a_hole_it_leaves_the_hole_first(place):
-    """The person who aborted frees the stylus by hand; until then nothing moves."""
-    b, store = place
-    made, control, starts = plan(), Control(), list[np.ndarray]()
+async def aborted_in_the_second_hole(place: tuple[Bench, Store], made: CampaignPlan) -> None:
+    """Abort during a touch; then free the stylus by hand, which leaves it in the hole."""
+    b, _ = place
+    control, starts = Control(), list[np.ndarray]()
     feel, loop = b.sim.world.controller.feel, asyncio.get_running_loop()
 
     def abort_in_the_second_hole(start, target, feed):
@@ -192,8 +193,38 @@ async def test_aborted_in_a_hole_it_leaves_the_hole_first(place):
     async with asyncio.timeout(within(10.0)):
         while b.sim.world.controller.moving:  # noqa: ASYNC110 - the simulated axes tell nobody
             await asyncio.sleep(0.01)
+
+
+async def test_aborted_in_a_hole_it_leaves_the_hole_first(place):
+    made = plan()
+    await aborted_in_the_second_hole(place, made)
     await on(place, made)
-    assert found(store) == ALL
+    assert found(place[1]) == ALL
+
+
+async def test_begun_anew_with_the_stylus_in_a_hole_it_stops_at_the_wall(place):
+    b, store = place
+    await aborted_in_the_second_hole(place, plan())
+    begin = b.sim.world.controller.position_mm.copy()
+    with pytest.raises(Obstructed, match="on its way to where the artefact is mounted"):
+        await measure(b.session, store, b.site, CampaignPlan("another", plan().tests), options=MeasureOptions(None))
+    assert np.abs(b.sim.world.controller.position_mm - begin).max() < 0.01, "it backed off"
+
+
+async def test_a_stylus_that_stays_deflected_is_taken_out_and_named(place, monkeypatch):
+    b, _ = place
+    world, state = b.sim.world, ModbusController.probe_state
+
+    async def stuck(self):
+        now = await state(self)
+        inside = world.controller.position_mm[2] < 210.0
+        return replace(now, deflected=True) if inside else now
+
+    made = plan()
+    monkeypatch.setattr(ModbusController, "probe_state", stuck)
+    with pytest.raises(ProbeNotReady, match="stays deflected"):
+        await run(place, made)
+    assert world.controller.position_mm[2] > 210.0, "above the plate"
 
 
 async def test_an_open_door_stops_it_as_everything_else(place):

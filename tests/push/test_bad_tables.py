@@ -103,17 +103,3 @@ def test_a_limit_itself_is_allowed_and_nothing_is_clamped() -> None:
     before = candidate.columns
     assert reasons_against(candidate, context, replace(LIMITS, change_mm=max(LIMITS.change_mm, worst))) == []
     assert candidate.columns is before
-
-
-def test_a_table_that_holds_its_end_value_assumes_nothing_there() -> None:
-    """All tables of X stand still from 416 mm on, up to which the runs went."""
-    candidate, context = good(Random(4))
-    reached = ((0.0, 416.0), (0.0, 640.0), (160.0, 640.0))
-    flat = []
-    for column in candidate.columns:
-        last = max(k for k, p in enumerate(column.position_mm) if p <= 416.0)
-        values = tuple(column.correction_mm[min(k, last)] for k in range(len(column.correction_mm)))
-        left = tuple(-v for v in values)
-        flat.append(replace(column, correction_mm=values, left_mm=left) if column.moved == "X" else column)
-    made = signed(replace(candidate, columns=tuple(flat), evidence=replace(candidate.evidence, reached_mm=reached)))
-    assert not [reason for reason in reasons_against(made, context, LIMITS) if reason.startswith("REACH")]

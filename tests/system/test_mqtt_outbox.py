@@ -14,7 +14,7 @@ import pytest
 from structlog.testing import capture_logs
 
 from abbe.service.clock import SystemClock
-from abbe.service.mqtt.broker import Topics, parse
+from abbe.service.mqtt.broker import TlsFiles, Topics, parse
 from abbe.service.mqtt.publisher import Publisher, StoreOutbox
 from abbe.service.storage.store import Store
 from tests.certificates import authority, issued
@@ -41,12 +41,14 @@ def store(tmp_path: Path) -> Iterator[Store]:
 class Sender:
     """A publisher with what it said: how often it was connected, lost, and dropped something."""
 
-    def __init__(self, url: str, store: Store, most: int = 10_000, down_to: int = 9_000, **broker: str) -> None:
+    def __init__(self, url: str, store: Store, most: int = 10_000, down_to: int = 9_000, **files: str) -> None:
         clock = SystemClock()
         self.changes: asyncio.Queue[bool] = asyncio.Queue()
         self.dropped: asyncio.Queue[int] = asyncio.Queue()
         outbox = StoreOutbox(store.outbox, TOPICS, clock, KEPT, most, down_to)
-        self.publisher = Publisher(replace(parse(url), **broker), TOPICS, outbox, clock, self.changes.put_nowait, self.dropped.put_nowait)
+        self.publisher = Publisher(
+            replace(parse(url), files=TlsFiles(**files)), TOPICS, outbox, clock, self.changes.put_nowait, self.dropped.put_nowait
+        )
 
     async def until(self, connected: bool) -> None:
         async with asyncio.timeout(within(40)):

@@ -17,7 +17,7 @@ from pydantic import Field as Limits
 from abbe.models.machine import Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject, Feature
 from abbe.service.errors import ConfigError
-from abbe.service.sequences.recipes.approach import RAPID_MM_MIN, Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
+from abbe.service.sequences.recipes.approach import Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
 from abbe.service.sequences.steps import MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
 
 BALL, HOLE = "xyz", "xy"
@@ -69,7 +69,7 @@ class ArtefactTest(TestRecipe):
             raise ConfigError(f"test {self.label}: the recipe has no artefact {self.artefact!r}", f"add a table [artefact.{self.artefact}]")
         touches = [self._touch(k, f) for k, f in enumerate(self.plate.features)]
         matrix = self.matrix()
-        steps: list[Step] = [MoveTo(self._aside(touches, machine), RAPID_MM_MIN)]
+        steps: list[Step] = [MoveTo(self._aside(touches, machine), self.feed_mm_min, guarded=True)]
         steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *self._order(touches)]
         if self.unmount:
             steps.append(Unmount())
