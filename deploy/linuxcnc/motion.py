@@ -45,7 +45,8 @@ class _Pending:
     is_path: bool
     points: int
     aborted: bool = False
-    is_touch: bool = False
+    touch_from_mm: Point | None = None
+    """Where a touch began; None: no touch."""
 
 
 class Motion:
@@ -140,7 +141,8 @@ class Motion:
             self.in_position_us = self._now_us()
         if self.state.ready:
             self._path_points = self._pending.points if arrived and self._pending.is_path else self._path_points
-            if self._pending.is_touch and self.state.tripped and not self._pending.aborted:
+            begun = self._pending.touch_from_mm
+            if begun is not None and self.state.tripped and not self._pending.aborted and begun != self.state.position_mm:  # no old trip
                 self.latch = self.state.probed_mm, self._now_us()
             self._end(counts=arrived or self._pending.aborted or self.latch is not None)
 
@@ -171,7 +173,7 @@ class Motion:
         zero = self._control.work_offset_mm()
         if zero is None:
             return Result.BAD_ARGUMENT
-        self._begin(_Pending(target_mm, is_path=False, points=0, is_touch=True))
+        self._begin(_Pending(target_mm, is_path=False, points=0, touch_from_mm=self.state.position_mm))
         x, y, z = (t - o for t, o in zip(target_mm, zero, strict=True))
         self._control.mdi(f"{_MODES} G61 G38.3 X{x:.9f} Y{y:.9f} Z{z:.9f} F{feed_mm_min:.2f}")
         return Result.OK

@@ -25,6 +25,7 @@ ONLY_LOOKS = {
     ("demo/demo.py", "run_demo"): "a control of its own, begun with this database",
     ("demo/demo_serve.py", "run_served_demo"): "the same",
     ("demo/demo_hidden.py", "run_hidden_demo"): "the same",
+    ("demo/demo_artefact.py", "run_artefact_demo"): "the same",
 }
 
 
