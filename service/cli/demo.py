@@ -42,7 +42,8 @@ def demo(  # noqa: PLR0913 - one argument for each option
 
     With --serve: the service checks the machine by a timetable; the machine drifts, an alarm reports it, and a proposal waits in the page
     for a person; after approval the service pushes and verifies it. With --hidden: find the physical effect that the model of the
-    machine lacks, prove it on a new measurement, and reveal the truth. With --artefact: no ball-bar and no laser measure, but the probe.
+    machine lacks, prove it on a new measurement, and reveal the truth. With --artefact: the probe measures; the ball-bar only
+    proves the sign of the tables.
     """
     if artefact:
         artefact_demo(seed, speed, as_json, keep)

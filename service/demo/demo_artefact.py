@@ -122,7 +122,7 @@ def summary_lines(result: ArtefactDemo) -> list[str]:
         after, u_after = figure_rows(c.after)[name]
         lines.append(f"{name}: {plain(value)} ± {plain(COVERAGE * u)} -> {plain(after)} ± {plain(COVERAGE * u_after)} (95 %)")
     lines += [("kept: " if c.decision.keep else "rolled back: ") + c.decision.text]
-    lines += [f"tables act {line}" for line in c.not_for_tables]
+    lines += [f"tables: {line}" for line in c.not_for_tables]
     true = [float(t["plane_rms_um"]) for t in (result.truth_before, result.truth_after)]
     return [*lines, f"sealed truth, rms in this plane: {plain(true[0])} -> {plain(true[1])} µm"]
 
