@@ -13,19 +13,16 @@ from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import ValidationError
-from pydantic_core import ErrorDetails
 from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
 from pydantic_settings.exceptions import SettingsError
 
 from abbe.drivers.links.urls import beside
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
-from abbe.service.errors import ConfigError, expected, location_text, nearest
+from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
-UNKNOWN_KEY = ("extra_forbidden", "unexpected_keyword_argument")
-"""Pydantic's error types for a key that a model or a dataclass does not have."""
 Origin = Literal["default", "file", "environment"]
 
 
@@ -70,7 +67,7 @@ def load_machine(path: Path | str) -> LoadedMachine:
         # Via JSON: there, strict mode refuses text for a number but still accepts a list for a tuple.
         machine = MachineFile.model_validate_json(json.dumps(merged, default=str), strict=True)
     except ValidationError as err:
-        raise _config_error(path, err.errors(), from_environment) from None
+        raise _config_error(path, mistakes(err.errors()), from_environment) from None
     _check_exclusive(path, merged)
     machine = _with_files(machine, path.resolve().parent)
     origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
@@ -156,19 +153,17 @@ def _leaves(values: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
             yield prefix + key, value
 
 
-def _config_error(path: Path, errors: list[ErrorDetails], environment: Mapping[str, Any]) -> ConfigError:
-    # A mistyped key is both unknown and missing: naming the unknown one helps more.
-    first, more = min(errors, key=lambda one: one["type"] not in UNKNOWN_KEY), len(errors) - 1
-    location = first["loc"]
+def _config_error(path: Path, errors: list[Mistake], environment: Mapping[str, Any]) -> ConfigError:
+    first, tail = errors[0], and_more(errors)
+    location = first.place
     source = f"{PREFIX} environment" if _contains(environment, location) else str(path)
-    tail = f" (and {more} more)" if more else ""
     key = location_text(location)
-    if first["type"] in UNKNOWN_KEY:
+    if first.unknown_key:
         hint = nearest(str(location[-1]), _siblings(location))
         return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
-    if first["type"] == "missing":
+    if first.kind == "missing":
         return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
-    wanted = expected(first).replace("expected an object", "expected a table of keys")
+    wanted = first.expected.replace("expected an object", "expected a table of keys")
     at = f"{source}: {key}" if key else source  # an error of the whole file has no key
     return ConfigError(mask_secrets(f"{at}: {wanted}{tail}"), "correct it; `abbe schema` describes every key")
 

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import difflib
 from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
@@ -445,16 +446,49 @@ def location_text(location: tuple[int | str, ...]) -> str:
     return text
 
 
-def expected(error: ErrorDetails) -> str:
-    """Return one line: what was expected and what was found."""
-    message = (
-        error["msg"].removeprefix("Value error, ").replace("Input should be a valid", "expected a").replace("Input should be", "expected")
-    )
-    for noun in ("integer", "array", "object"):
-        message = message.replace(f"expected a {noun}", f"expected an {noun}")
-    if error["type"] == "value_error":
-        return message  # our own validators already include the value
-    return f"{message}, got {short_repr(error['input'])}"
+@dataclass(frozen=True, slots=True)
+class Mistake:
+    """A mistake found by pydantic; ``place``: keys and indices down to it; ``kind``: pydantic's type of error; ``value``: what is there."""
+
+    place: tuple[int | str, ...]
+    kind: str
+    message: str
+    value: Any = None
+
+    @property
+    def unknown_key(self) -> bool:
+        """Whether a model or a dataclass has no such key."""
+        return self.kind in ("extra_forbidden", "unexpected_keyword_argument")
+
+    @property
+    def path(self) -> str:
+        """The place with dots, each part at most 100 characters."""
+        return ".".join(str(part)[:100] for part in self.place)
+
+    @property
+    def expected(self) -> str:
+        """One line: what was expected and what was found."""
+        plain = self.message.removeprefix("Value error, ")
+        plain = plain.replace("Input should be a valid", "expected a").replace("Input should be", "expected")
+        for noun in ("integer", "array", "object"):
+            plain = plain.replace(f"expected a {noun}", f"expected an {noun}")
+        if self.kind == "value_error":
+            return plain  # our own validators already include the value
+        return f"{plain}, got {short_repr(self.value)}"
+
+
+def mistakes(errors: Iterable[ErrorDetails]) -> list[Mistake]:
+    """Parse the errors of a pydantic ``ValidationError``; one that is due to an unknown key first.
+
+    A mistyped key is both unknown and missing: naming the unknown one helps more.
+    """
+    found = [Mistake(one["loc"], one["type"], one["msg"], one.get("input")) for one in errors]
+    return sorted(found, key=lambda one: not one.unknown_key)
+
+
+def and_more(errors: Sequence[Mistake]) -> str:
+    """Return how many mistakes there are besides the first; empty for none."""
+    return f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
 
 
 def nearest(key: str, valid: Iterable[str]) -> str:

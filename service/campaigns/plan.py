@@ -20,7 +20,7 @@ from abbe.models.planning.plan import INNER_SHARE, PLAN_ORDER, MeasuringPlan, Pl
 from abbe.models.planning.search import COVERAGE
 from abbe.service.config import read_toml
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
-from abbe.service.errors import ConfigError, expected, location_text, nearest
+from abbe.service.errors import ConfigError, location_text, mistakes, nearest
 from abbe.service.rendering.document import Document, Lines, PictureBlock, Section, TextTable
 from abbe.service.rendering.plots.views import DrawnTest, setups_picture
 from abbe.service.sequences.check import DryRun, dry_run_campaign, paced
@@ -78,12 +78,12 @@ def read_instruments(path: Path | None) -> Instruments:
             setup=times,
         )
     except ValidationError as error:
-        first = error.errors()[0]
-        place = first["loc"]
-        if first["type"] == "extra_forbidden":
+        first = mistakes(error.errors())[0]
+        place = first.place
+        if first.unknown_key:
             table = SetupTable if place[0] == "setup" and len(place) > 1 else InstrumentsFile
             raise ConfigError(f"{path}: unknown key {location_text(place)!r}", nearest(str(place[-1]), table.model_fields)) from None
-        raise ConfigError(f"{path}: {location_text(place)}: {expected(first)}", "correct it; docs/how-to/plan.md shows a file") from None
+        raise ConfigError(f"{path}: {location_text(place)}: {first.expected}", "correct it; docs/how-to/plan.md shows a file") from None
     except ValueError as error:
         raise ConfigError(f"{path}: {error}", "give bar_lengths_mm or laser = true") from None
 

@@ -24,7 +24,7 @@ from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
-from abbe.service.errors import ChannelBroken
+from abbe.service.errors import ChannelBroken, mistakes
 
 T = TypeVar("T")
 
@@ -268,9 +268,8 @@ def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
     try:
         return adapter.validate_json(body)
     except ValidationError as wrong:
-        first = wrong.errors(include_input=False, include_url=False)[0]
-        location = ".".join(str(part) for part in first["loc"])
-        raise ChannelBroken(f"invalid message between core and web process: {location}: {first['msg']}") from None
+        first = mistakes(wrong.errors(include_input=False, include_url=False))[0]
+        raise ChannelBroken(f"invalid message between core and web process: {first.path}: {first.message}") from None
 
 
 _LENGTH = struct.Struct(">I")

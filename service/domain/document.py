@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from pydantic import TypeAdapter, ValidationError
 
-from abbe.service.errors import Unusable
+from abbe.service.errors import Unusable, mistakes
 
 Doc = dict[str, Any]
 """A JSON object."""
@@ -77,9 +77,9 @@ def record(kind: type[T], doc: object, what: str) -> T:
     try:
         found: T = _adapter(kind).validate_python(doc)
     except ValidationError as error:
-        first = error.errors()[0]
-        path = ".".join(str(part) for part in first["loc"])
-        raise Unusable(f"{what} has another form than expected: {path}: {first['msg']}", "make it again with this version") from None
+        first = mistakes(error.errors())[0]
+        why = f"{what} has another form than expected: {first.path}: {first.message}"
+        raise Unusable(why, "make it again with this version") from None
     return found
 
 

@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError, model_valida
 
 from abbe.models.arrays import F1
 from abbe.service.config_schema import COLDEST_C, WARMEST_C
-from abbe.service.errors import AbbeError, FileFormatError, expected, location_text
+from abbe.service.errors import AbbeError, FileFormatError, location_text, mistakes
 from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.answers import ANGLES, LENGTHS
 from abbe.service.instrument_files.content import AxisReadings, Content, axis_of, digest, read_bytes, step_of, text_file
@@ -148,9 +148,9 @@ def column_file(path: Path) -> ColumnFile:
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
         raise FileFormatError(f"{path}: no TOML: {err}", "see docs/how-to/import.md") from None
     except ValidationError as err:
-        first = err.errors()[0]
-        place = location_text(first["loc"])
-        raise FileFormatError(f"{path}: {f'{place}: ' if place else ''}{expected(first)}", "see docs/how-to/import.md") from None
+        first = mistakes(err.errors())[0]
+        place = location_text(first.place)
+        raise FileFormatError(f"{path}: {f'{place}: ' if place else ''}{first.expected}", "see docs/how-to/import.md") from None
 
 
 def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> FileRows:

@@ -13,7 +13,7 @@ from pydantic import BaseModel, ValidationError
 from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactRunFile, ArtefactSetupObject, PointColumns
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run_file import ColumnsObject, RunFile, SetupObject
-from abbe.service.errors import FileFormatError, expected, location_text, short_repr
+from abbe.service.errors import FileFormatError, and_more, location_text, mistakes, short_repr
 from abbe.service.files import NotPlainError, read_plain
 
 MAX_DIGITS = 308
@@ -198,20 +198,20 @@ def _check_finite(path: Path, value: object, location: tuple[int | str, ...] = (
 
 
 def _format_error(path: Path, err: ValidationError) -> FileFormatError:
-    errors = err.errors()
+    errors = mistakes(err.errors())
     # Of a union ("a list or null") pydantic reports every branch; the deepest one is what the author meant.
-    first = max((one for one in errors if one["loc"][:2] == errors[0]["loc"][:2]), key=lambda one: len(one["loc"]))
+    first = max((one for one in errors if one.place[:2] == errors[0].place[:2]), key=lambda one: len(one.place))
     location = tuple(
-        part for part in first["loc"] if not (isinstance(part, str) and (part.startswith(("list[", "tuple[")) or part in _TYPE_TAGS))
+        part for part in first.place if not (isinstance(part, str) and (part.startswith(("list[", "tuple[")) or part in _TYPE_TAGS))
     )
-    tail = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
-    if first["type"] == "missing":
+    tail = and_more(errors)
+    if first.kind == "missing":
         return FileFormatError(f"{path}: key {location_text(location)!r} is missing{tail}", "see docs/schemas")
     place = location_text(location)
     if location[:1] == ("columns",) and len(location) == 3 and isinstance(location[2], int):
         place = f"columns.{location[1]}, row {location[2] + 1}"
     prefix = f"{path}: {place}: " if place else f"{path}: "
-    return FileFormatError(prefix + expected(first) + tail, "correct the file")
+    return FileFormatError(prefix + first.expected + tail, "correct the file")
 
 
 _TYPE_TAGS = frozenset({"float", "int", "str", "polynomial", "table", "function-after[check_interval(), tuple[float, float]]"})

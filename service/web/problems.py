@@ -10,7 +10,7 @@ from fastapi.responses import JSONResponse
 from starlette.exceptions import HTTPException
 from starlette.requests import ClientDisconnect
 
-from abbe.service.errors import AbbeError
+from abbe.service.errors import AbbeError, mistakes
 from abbe.service.web.catalogue import DEFECT, HTTP, status_of
 from abbe.service.web.schemas import Problem
 
@@ -48,10 +48,9 @@ async def _disconnected(_: Request, error: Exception) -> JSONResponse:
 
 async def _invalid(_: Request, error: Exception) -> JSONResponse:
     assert isinstance(error, RequestValidationError)
-    first = error.errors()[0]
-    location = ".".join(str(part)[:100] for part in first["loc"])
+    first = mistakes(error.errors())[0]
     # An impossible number is answered like an unknown number.
-    return problem(404 if first["loc"][0] == "path" else 422, f"{location}: {first['msg']}")
+    return problem(404 if first.place[0] == "path" else 422, f"{first.path}: {first.message}")
 
 
 async def _abbe(_: Request, error: Exception) -> JSONResponse:

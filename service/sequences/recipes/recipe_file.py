@@ -15,10 +15,9 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
-from pydantic_core import ErrorDetails
 
 from abbe.service.domain.artefact import ArtefactObject
-from abbe.service.errors import ConfigError, expected, location_text, nearest
+from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.sequences.recipes.approach import LOW_SHARE, Cup, TestRecipe, file_fields, file_table, pole_of
 from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.recipes.recipe import BarRecipe, Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear, Recipe
@@ -161,7 +160,7 @@ def parse_recipe(text: str, source: str) -> tuple[str, tuple[Recipe, ...]]:
         # Through JSON: strict mode then refuses text for a number, but takes a list for a tuple.
         found = RecipeFile.model_validate_json(json.dumps(content, default=str), strict=True)
     except ValidationError as error:
-        raise _config_error(source, error.errors()) from None
+        raise _config_error(source, mistakes(error.errors())) from None
     return found.name, shared_setups(found.recipes(), source)
 
 
@@ -178,20 +177,19 @@ def _check_keys(content: dict[str, Any], source: str) -> None:
             table.setdefault("role", "identify")
 
 
-def _config_error(source: str, errors: list[ErrorDetails]) -> ConfigError:
-    first, more = min(errors, key=lambda one: one["type"] != "extra_forbidden"), len(errors) - 1
-    tail = f" (and {more} more)" if more else ""
-    place = tuple(p for p in first["loc"] if p not in KINDS)
-    if first["type"] == "extra_forbidden":
+def _config_error(source: str, errors: list[Mistake]) -> ConfigError:
+    first, tail = errors[0], and_more(errors)
+    place = tuple(p for p in first.place if p not in KINDS)
+    if first.unknown_key:
         return ConfigError(f"{source}: unknown key {location_text(place)!r}{tail}", nearest(str(place[-1]), list(RecipeFile.model_fields)))
-    if first["type"] == "union_tag_not_found":
+    if first.kind == "union_tag_not_found":
         return ConfigError(
             f"{source}: key {location_text((*place, 'kind'))!r} is missing{tail}", f"add kind = {' or '.join(map(repr, KINDS))}"
         )
-    if first["type"] == "missing":
+    if first.kind == "missing":
         return ConfigError(f"{source}: key {location_text(place)!r} is missing{tail}", f"add {place[-1]} = ...")
     return ConfigError(
-        f"{source}: {location_text(place)}: {expected(first)}{tail}", "correct it; docs/reference/recipe-file.md has all keys"
+        f"{source}: {location_text(place)}: {first.expected}{tail}", "correct it; docs/reference/recipe-file.md has all keys"
     )
 
 
