@@ -251,11 +251,13 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
         return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *slope_and_u)
     reached = max(float(sums.knots[best] - sums.level()[best] / slope), 0.0)
     span = float(days[-1] - days[0])
-    ahead = np.concatenate([[0.0], span * np.geomspace(1e-3, FARTHEST, 600)])
+    # Beside the day itself the grid is as fine as the narrowest interval that rounding leaves.
+    near = reached * (1.0 + np.concatenate([-np.geomspace(1e-6, 0.1, 120), np.geomspace(1e-6, 0.1, 120)]))
+    ahead = np.unique(np.concatenate([[0.0, reached], near, span * np.geomspace(1e-3, FARTHEST, 600)]))
     inside = np.flatnonzero(sums.squares_if(ahead) - left[best] <= scale2 * f_limit(1 - level, 1, n - 3))
     if reached == 0.0 and not len(inside):
         return Forecast(0.0, 0.0, 0.0, "", *slope_and_u)
-    if reached > ahead[-1] or not len(inside) or inside[-1] == len(ahead) - 1:
+    if reached > span * FARTHEST or not len(inside) or inside[-1] == len(ahead) - 1:
         return Forecast(np.nan, np.nan, np.nan, "not known: it may take very long", *slope_and_u)
     return Forecast(reached, float(ahead[max(inside[0] - 1, 0)]), float(ahead[inside[-1] + 1]), "", *slope_and_u)
 

@@ -16,8 +16,8 @@ from abbe.service.domain.verification import Verification
 from abbe.service.errors import Unusable
 from abbe.service.identification.solution_field import node_map, stored_field
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, finite, of_row, read_as, storable
-from abbe.service.verification.trend_table import FigureTrend
-from abbe.service.verification.trend_table import trends as figure_trends
+from abbe.service.verification.trend_table import FigureChart, FigureTrend
+from abbe.service.verification.trend_table import charts as figure_charts
 from abbe.service.verification.verified_by import VerifiedBy, verified_by
 
 
@@ -223,5 +223,10 @@ def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limi
     if not storable(machine):
         return Trends(machine=machine)
     known = verified_by(reader.store, machine, control=reader.control_of(machine))
-    found = figure_trends(reader.store.verifications.of_machine(machine, limit), after_utc or known.since)
-    return Trends(machine=machine, figures=found, verified=known)
+    found = charts(reader, machine, after_utc or known.since, limit)
+    return Trends(machine=machine, figures=[one.told for one in found], verified=known)
+
+
+def charts(reader: Reader, machine: str, after_utc: datetime | None, limit: int = CHECKS) -> list[FigureChart]:
+    """Control charts of a machine's judged figures over at most ``limit`` of its checks, later than ``after_utc``."""
+    return figure_charts(reader.store.verifications.of_machine(machine, limit), after_utc)

@@ -10,7 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from abbe.models.trend import CUSUM_H, CUSUM_K, average_run_length, trend
+from abbe.models.arrays import F1
+from abbe.models.trend import CUSUM_H, CUSUM_K, Trend, average_run_length, mean_of, trend
 from abbe.service.domain.results import VerificationRecord
 
 DAY_S = 86400.0
@@ -56,8 +57,60 @@ class FigureTrend:
         return f"{_days(self.days_until_limit)} ({_days(low)} to {_days(high)})"
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class FigureChart:
+    """One figure of the checks in order of time, with its control chart (`abbe.models.trend`).
+
+    ``values``, ``expanded``: in the figure's unit, U with k = 2; ``limit``: of the latest check.
+    """
+
+    figure: str
+    at: Sequence[datetime]
+    values: F1
+    expanded: F1
+    limit: float | None
+    found: Trend
+
+    @property
+    def centre(self) -> float:
+        """The mean with which the chart compares: of the checks before a drift, or of all."""
+        before = len(self.values) if self.found.since is None else max(self.found.since, 1)
+        return mean_of(self.values[:before], self.expanded[:before] / COVERAGE)[0]
+
+    @property
+    def told(self) -> FigureTrend:
+        """What the chart says after the latest check."""
+        found, ahead = self.found, self.found.forecast
+        since, certain = (None if k is None else self.at[k] for k in (found.since, found.found))
+        return FigureTrend(
+            figure=self.figure,
+            checks=len(self.at),
+            latest=float(self.values[-1]),
+            expanded_uncertainty=float(self.expanded[-1]),
+            limit=self.limit,
+            state=found.state,
+            direction=found.direction,
+            since_utc=since,
+            found_utc=certain,
+            change_per_day=_known(ahead.slope),
+            change_per_day_u=_known(ahead.slope_u),
+            days_until_limit=_known(ahead.days),
+            days_until_limit_95=None if ahead.reason else (float(ahead.low), float(ahead.high)),
+            reason=ahead.reason,
+            cusum_high=_known(found.high[-1]),
+            cusum_low=_known(found.low[-1]),
+            ewma=_known(found.ewma[-1]),
+            ewma_limit=_known(found.ewma_limit[-1]),
+        )
+
+
 def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureTrend]:
-    """Trend of every figure that has a limit in the latest check with figures.
+    """What the charts of `charts` say after the latest check."""
+    return [one.told for one in charts(records, after_utc)]
+
+
+def charts(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureChart]:
+    """Control chart of every figure that has a limit in the latest check with figures.
 
     ``records`` may have any order; checks without a figure or a valid uncertainty are left out of its series. Only checks after
     ``after_utc`` count, because a new table or a repair begins a new series.
@@ -94,35 +147,14 @@ def _rows(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> list[tup
     return rows
 
 
-def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> FigureTrend | None:
+def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> FigureChart | None:
     rows = _rows(key, docs)
     if not rows:
         return None
     limit = docs[-1][1]["limits"].get(key)
     days = np.array([(at - rows[0][0]).total_seconds() / DAY_S for at, _, _ in rows])
-    found = trend(days, np.array([v for _, v, _ in rows]), np.array([u / COVERAGE for _, _, u in rows]), limit)
-    since, certain = (None if k is None else rows[k][0] for k in (found.since, found.found))
-    ahead = found.forecast
-    return FigureTrend(
-        figure=key,
-        checks=len(rows),
-        latest=rows[-1][1],
-        expanded_uncertainty=rows[-1][2],
-        limit=limit,
-        state=found.state,
-        direction=found.direction,
-        since_utc=since,
-        found_utc=certain,
-        change_per_day=_known(ahead.slope),
-        change_per_day_u=_known(ahead.slope_u),
-        days_until_limit=_known(ahead.days),
-        days_until_limit_95=None if ahead.reason else (float(ahead.low), float(ahead.high)),
-        reason=ahead.reason,
-        cusum_high=_known(found.high[-1]),
-        cusum_low=_known(found.low[-1]),
-        ewma=_known(found.ewma[-1]),
-        ewma_limit=_known(found.ewma_limit[-1]),
-    )
+    values, expanded = np.array([v for _, v, _ in rows]), np.array([u for _, _, u in rows])
+    return FigureChart(key, [at for at, _, _ in rows], values, expanded, limit, trend(days, values, expanded / COVERAGE, limit))
 
 
 def _known(value: float) -> float | None:

@@ -53,6 +53,21 @@ ICON = (
 )
 
 
+def has_uplot() -> bool:
+    """Whether the library for curves that can be zoomed was fetched (deploy/uplot.py)."""
+    return (HERE / "static" / "uplot" / "uPlot.iife.min.js").exists()
+
+
+def plot_files() -> Markup:
+    """The tags that load it and our script; nothing without it."""
+    if not has_uplot():
+        return Markup("")
+    css, library, ours = "/static/uplot/uPlot.min.css", "/static/uplot/uPlot.iife.min.js", "/static/plot.js"
+    return Markup('<link rel="stylesheet" href="{}"><script defer src="{}"></script><script type="module" src="{}"></script>').format(
+        css, library, ours
+    )
+
+
 @cache
 def environment() -> Environment:
     """The template environment. It escapes everything, since names and fault texts come from devices and files.
@@ -68,7 +83,7 @@ def environment() -> Environment:
     env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
     # Pictures come from our own SVG writer, which has escaped every text.
     env.filters["picture"] = Markup
-    env.globals |= template_functions() | {"step_address": step_address}
+    env.globals |= template_functions() | {"step_address": step_address, "has_uplot": has_uplot, "plot_files": plot_files}
     return env
 
 
@@ -108,13 +123,20 @@ def figures(past: Sequence[Verification]) -> list[str]:
 
 def trends(past: Sequence[Verification], zone: tzinfo, changes: Sequence[datetime] = ()) -> list[Markup]:
     """A plot for each figure; ``changes``: times at which another table came into force."""
-    plots = []
-    for key in figures(past):
-        name, unit = language.figure(current().lang, key)
-        points = [point for check in past if (point := _point(check, key, unit, changes)) is not None]
-        if points:
-            plots.append(Markup(trend_svg(name, current().unit(unit), points, zone, changes)))  # noqa: S704 - our own writer, which escapes
-    return plots
+    found = [(key, points_of(past, key, changes)) for key in figures(past)]
+    return [trend_picture(key, points, zone, changes) for key, points in found if points]
+
+
+def trend_picture(key: str, points: Sequence[Point], zone: tzinfo, changes: Sequence[datetime]) -> Markup:
+    """The plot of one figure in the reader's language; its points must not be empty."""
+    name, unit = language.figure(current().lang, key)
+    return Markup(trend_svg(name, current().unit(unit), points, zone, changes))  # noqa: S704 - our own writer, which escapes
+
+
+def points_of(past: Sequence[Verification], key: str, changes: Sequence[datetime]) -> list[Point]:
+    """A figure of the checks that have it, in the reader's unit."""
+    unit = language.figure(current().lang, key)[1]
+    return [point for check in past if (point := _point(check, key, unit, changes)) is not None]
 
 
 def _lengths(rows: Sequence[Sequence[str]], *at: int) -> list[list[str]]:

@@ -18,6 +18,7 @@ import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route
 
 from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.web.page import has_uplot
 from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, filled_once, screens, served
 from tests.system.test_serve_page import ARTIFACTS
 
@@ -341,6 +342,53 @@ def test_the_map_of_the_volume_is_turned_zoomed_and_asked(chromium, running, axe
         page.wait_for_function("() => document.querySelector('[name=level-text]').textContent.startsWith('Y ')")
         assert watch.errors == []
         assert watch.foreign == []
+
+
+def test_a_trend_is_zoomed_read_and_taken_along(chromium, running, axe) -> None:
+    if not has_uplot():
+        pytest.skip("uPlot was not fetched (deploy/uplot.py)")
+    with context(chromium, "1024", "dark") as made:
+        page = made.new_page()
+        watch = Watch(page, running.base)
+        log_in(page, running.base, "vera")
+        page.goto(f"{running.base}/trends")
+        page.wait_for_function(MAP_READY)
+        assert page.evaluate("() => performance.now()") < 5000.0
+        box = page.locator("[data-plot]").first
+        assert box.locator("svg").count() == 0, "the picture makes room"
+        assert box.locator("canvas").count() == 2
+        box.focus()
+        page.keyboard.press("ArrowLeft")
+        page.keyboard.press("ArrowLeft")
+        last = running.store.verifications.latest(limit=2)[-1]
+        told = box.locator("output").inner_text()
+        value, u = last.doc["values"]["body_diagonal_um"], last.doc["uncertainties"]["body_diagonal_um"]
+        assert f": {value:.1f} ± {u:.1f} µm (U, k = 2), cannot tell" in told
+        assert "CUSUM ↑" in told
+        assert box.locator("a.open").get_attribute("href") == f"/check?id={last.id}"
+        before = pixels(page)
+        page.keyboard.press("+")
+        page.wait_for_timeout(100)
+        assert pixels(page) != before, "the axis shows less, larger"
+        page.keyboard.press("0")
+        page.wait_for_timeout(100)
+        assert pixels(page) == before
+        with page.expect_download() as table:
+            box.locator("[data-do=csv]").click()
+        rows = Path(table.value.path()).read_text(encoding="utf-8").splitlines()
+        assert rows[0].startswith("check,time,body_diagonal_um [µm],U (k=2) [µm],limit [µm],verdict")
+        assert len(rows) == 1 + 23
+        with page.expect_download() as picture:
+            box.locator("[data-do=png]").click()
+        assert picture.value.suggested_filename == "body_diagonal_um.png"
+        assert violations(page, axe, "{}") == []
+        assert page.evaluate(SMALL) == []
+        assert watch.errors == []
+        assert watch.foreign == []
+
+
+def pixels(page: Page) -> str:
+    return str(page.evaluate("() => document.querySelector('[data-plot] canvas').toDataURL()"))
 
 
 def view(page: Page) -> str:

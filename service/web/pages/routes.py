@@ -199,7 +199,10 @@ def _add_times(app: FastAPI, context: PageContext) -> None:
     async def trends() -> HTMLResponse:
         past, status = await context.source.verifications(times.CHECKS), await context.source.status()
         screen = await context.read(times.trend_screen, context.reader, past, status)
-        return await context.show("trends.html", verified=status.verified, plots=screen.plots, charts=screen.charts, checks=len(past))
+        words = {key: current().translate(key) for key in times.PLOT_WORDS}
+        return await context.show(
+            "trends.html", verified=status.verified, plots=screen.plots, charts=screen.charts, checks=len(past), words=words
+        )
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)

@@ -4,24 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from datetime import datetime, timedelta, tzinfo
 
+import numpy as np
 from markupsafe import Markup
 
+from abbe.models.trend import CUSUM_H
+from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.reader import Reader
-from abbe.service.queries.results import trends
-from abbe.service.queries.status import Status
+from abbe.service.queries.results import charts
+from abbe.service.queries.status import AlarmSummary, Status, alarms
 from abbe.service.queries.timetable import NextDue, past_slots
-from abbe.service.verification.trend_table import FigureTrend
+from abbe.service.rendering.numbers import with_uncertainty
+from abbe.service.verification.trend_table import FigureChart, FigureTrend
 from abbe.service.web import language
 from abbe.service.web.frame import current
-from abbe.service.web.page import trends as trend_plots
+from abbe.service.web.page import figures, points_of, trend_picture
 from abbe.service.web.pages.context import zone_of
+from abbe.service.web.trend import Point
+from abbe.service.web.units import converted
 
 CHECKS = 300
 SLOTS = 30
 AUDIT_ROWS = 200
+PLOT_WORDS = ("check.open", "plot.at", "plot.share", "verdict.cannot tell", "verdict.fail", "verdict.pass")
+VERDICTS = ("pass", "cannot tell", "fail")
 
 
 @dataclass(frozen=True, slots=True)
@@ -35,10 +44,18 @@ class TrendLine:
 
 
 @dataclass(frozen=True, slots=True)
+class TrendPlot:
+    """All checks of a figure as a picture, and as the series that the page's script draws; None: it has no control chart."""
+
+    picture: Markup
+    series: dict[str, object] | None
+
+
+@dataclass(frozen=True, slots=True)
 class TrendScreen:
     """Plots of all checks, and control charts of the checks with the table in force."""
 
-    plots: Sequence[Markup]
+    plots: Sequence[TrendPlot]
     charts: Sequence[TrendLine]
 
 
@@ -53,9 +70,83 @@ class ScheduleLine:
 
 def trend_screen(reader: Reader, past: Sequence[Verification], status: Status) -> TrendScreen:
     """Plots and control charts of the judged figures; ``past``: checks, newest first."""
-    found = trends(reader, status.machine, limit=CHECKS)
-    plots = trend_plots(past, zone_of(status), status.verified.changes)
-    return TrendScreen(plots, [_line(one) for one in found.figures])
+    zone, changes = zone_of(status), status.verified.changes
+    found = {one.figure: one for one in charts(reader, status.machine, status.verified.since, CHECKS)}
+    known = alarms(reader.store, status.machine, every=True)
+    plots = []
+    for key in figures(past):
+        points = points_of(past, key, changes)
+        if points:
+            chart = found.get(key)
+            series = None if chart is None else trend_series(chart, points, zone, _marks(key, changes, known))
+            plots.append(TrendPlot(trend_picture(key, points, zone, changes), series))
+    return TrendScreen(plots, [_line(one.told) for one in found.values()])
+
+
+def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary]) -> list[tuple[datetime, str, str, str]]:
+    """Time, kind, sign and text of what happened to a figure: another table, an alarm raised and over."""
+    frame = current()
+    marks = [(at, "table", "┊", frame.translate("plot.table")) for at in changes]
+    for one in known:
+        if any(signal.figure == key for signal in one.signals):
+            text = f"{frame.translate('alarm')} {one.alarm}"
+            marks.append((one.raised_utc, "alarm", "▲", f"{text} {frame.state('alarm.state', 'raised')}"))
+            if one.cleared_utc is not None:
+                marks.append((one.cleared_utc, "over", "▽", f"{text} {frame.state('alarm.state', 'cleared')}"))
+    return marks
+
+
+def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
+    """What the script draws: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970."""
+    frame = current()
+    name, unit = language.figure(frame.lang, chart.figure)
+    points = sorted(points, key=lambda point: point.at)
+    shown = [with_uncertainty(point.value, point.uncertainty / 2.0 or None) for point in points]
+    found = chart.found
+    return {
+        "key": chart.figure,
+        "name": name,
+        "unit": frame.unit(unit),
+        "zone": str(zone),
+        "x": [_s(point.at) for point in points],
+        "y": [_short(point.value) for point in points],
+        "u": [_short(point.uncertainty) for point in points],
+        "shown": shown,
+        "limit": [None if point.limit is None else _short(point.limit) for point in points],
+        "verdict": [VERDICTS.index(point.verdict) for point in points],
+        "earlier": [int(point.earlier) for point in points],
+        "check": [int(point.href.rpartition("=")[2]) for point in points],
+        "centre": _short(converted(chart.centre, unit, frame.units)),
+        "cone": _cone(chart, unit),
+        "marks": [{"at": _s(at), "kind": kind, "sign": sign, "text": text} for at, kind, sign, text in marks],
+        "chart": {
+            "x": [_s(at) for at in chart.at],
+            "h": CUSUM_H,
+            "high": [_short(v) for v in found.high],
+            "low": [_short(v) for v in found.low],
+            "ewma": [_short(v) for v in found.ewma],
+            "ewma_limit": [_short(v) for v in found.ewma_limit],
+        },
+    }
+
+
+def _cone(chart: FigureChart, unit: str) -> Doc | None:
+    """The forecast from the last check on: its fitted value, and the times at which the limit is reached; None without a forecast."""
+    ahead, last, limit = chart.found.forecast, chart.at[-1], chart.limit
+    if limit is None or not np.isfinite(ahead.high) or ahead.days == 0.0:
+        return None
+    level = converted(limit - ahead.slope * ahead.days, unit, current().units)
+    low, days, high = (_s(last + timedelta(days=one)) for one in (ahead.low, ahead.days, ahead.high))
+    ends = {"low": low, "days": days, "high": high, "limit": _short(converted(limit, unit, current().units))}
+    return {"at": _s(last), "value": _short(level)} | ends
+
+
+def _s(at: datetime) -> int:
+    return round(at.timestamp())
+
+
+def _short(value: float) -> float | None:
+    return float(f"{value:.6g}") if np.isfinite(value) else None
 
 
 def _line(one: FigureTrend) -> TrendLine:
@@ -63,8 +154,8 @@ def _line(one: FigureTrend) -> TrendLine:
     name, unit = language.figure(current().lang, one.figure)
     frame, ours = current(), current().unit(unit)
     limit = "–" if one.limit is None else f"{frame.length(f'{one.limit:g}', unit)} {ours}"
-    latest = f"{frame.length(f'{one.latest:.2f}', unit)} ± {frame.length(f'{one.expanded_uncertainty:.2f}', unit)} {ours}"
-    return TrendLine(name, latest, limit, one)
+    value, expanded = frame.with_u(one.latest, one.expanded_uncertainty / 2.0, unit)
+    return TrendLine(name, f"{value} ± {expanded} {ours}", limit, one)
 
 
 def schedule_lines(reader: Reader, status: Status) -> list[ScheduleLine]:

@@ -15,7 +15,6 @@ from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.login.access import route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
-from abbe.service.web.page import HERE
 from tests.pages_world import PHRASE, PROPOSER, USERS, Filled, Served, as_user, screens
 
 SVG = re.compile(r"<svg.*?</svg>", re.DOTALL)
@@ -182,20 +181,25 @@ def test_a_changed_proposal_is_shown_as_changed(running: Served) -> None:
         assert client.post("/proposal/approve", data={"number": str(number), "hours": "1"} | SIGNED).status_code == 503
 
 
-def static_bytes(client: httpx.Client) -> int:
-    """What the heaviest screen needs beside its HTML."""
-    names = ("page.css", "result.css", "status.js", "send.js", "volume.js", "volume_gl.js", "volume_shape.js")
-    static = sum((HERE / "static" / name).stat().st_size for name in names)
-    return static + len(client.get("/plots.css").content) + len(client.get("/icon.svg").content)
+def loaded(client: httpx.Client, page: str) -> int:
+    """Bytes of what a screen loads beside its HTML: its styles and scripts, and what these import."""
+    names = re.findall(r'(?:src|href)="(/static/[^"]+|/plots\.css|/icon\.svg)"', page)
+    total = 0
+    for name in names:
+        answer = client.get(name)
+        assert answer.status_code == 200, name
+        total += len(answer.content)
+        names += [f"/static/{one}" for one in re.findall(r'from "\./([^"]+)"', answer.text) if f"/static/{one}" not in names]
+    return total
 
 
 def test_screens_are_light_and_hold_no_inline_code(running: Served, pages: dict[str, str]) -> None:
     heaviest = {}
     with as_user(running, "anna") as client:
-        static = static_bytes(client)
+        beside = {path: loaded(client, pages[path]) for path in screens(running.filled)}
     for path in screens(running.filled):
         page = pages[path]
-        heaviest[path] = static + len(SVG.sub("", page).encode())
+        heaviest[path] = beside[path] + len(SVG.sub("", page).encode())
         assert " style=" not in page, path
         assert "<style" not in page, path
         assert re.findall(r"\son\w+=", page) == [], path

@@ -1,0 +1,334 @@
+// Curves to work with: zoom, cursor with value and U, export. uPlot draws them; where it was not fetched the pictures beside them stay.
+// A figure's series comes in `data-plot` of its box; texts in `data-words` of the list of boxes.
+
+const { uPlot } = globalThis;
+const VERDICTS = ["pass", "cannot tell", "fail"];
+const SHOWN = 6;
+
+function paint() {
+  const style = getComputedStyle(document.documentElement);
+  const of = (name) => style.getPropertyValue(name).trim();
+  return { line: of("--line"), text: of("--text"), quiet: of("--quiet"), accent: of("--accent"), fail: of("--fail"), pass: of("--pass"), unclear: of("--unclear") };
+}
+
+const number = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(SHOWN)).toString());
+
+function fill(text, values) {
+  return text.replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
+}
+
+function line(pen, points, colour, { dash = [], width = 1 } = {}) {
+  pen.save();
+  pen.strokeStyle = colour;
+  pen.lineWidth = width * devicePixelRatio;
+  pen.setLineDash(dash.map((one) => one * devicePixelRatio));
+  pen.beginPath();
+  points.forEach(([x, y], k) => (k ? pen.lineTo(x, y) : pen.moveTo(x, y)));
+  pen.stroke();
+  pen.restore();
+}
+
+function inside(u, draw) {
+  const { ctx: pen, bbox } = u;
+  pen.save();
+  pen.beginPath();
+  pen.rect(bbox.left, bbox.top, bbox.width, bbox.height);
+  pen.clip();
+  draw(pen, (x) => u.valToPos(x, "x", true), (y) => u.valToPos(y, "y", true), bbox);
+  pen.restore();
+}
+
+// ---- one plot: its frame, hand and keyboard -------------------------------------------------------------------------------------
+
+export class Plot {
+  // `options`: those of uPlot but for size, scales and cursor; `onMove(index)`: the cursor is at a point, or left (null).
+  constructor(host, options, data, height, onMove) {
+    this.host = host;
+    this.height = height;
+    this.whole = [data[0][0], data[0].at(-1)];
+    const quiet = { show: false };
+    this.plot = new uPlot({
+      width: Math.max(host.clientWidth, 200),
+      height,
+      legend: quiet,
+      cursor: { drag: { x: true, y: false, uni: 20 }, points: quiet, y: false },
+      ...options,
+      hooks: { ...options.hooks, setCursor: [(u) => onMove(u.cursor.idx ?? null)] },
+    }, data, host);
+    new ResizeObserver(() => this.resize()).observe(host);
+    this.touch();
+  }
+
+  resize() {
+    const width = this.host.clientWidth;
+    if (width && width !== this.plot.width) this.plot.setSize({ width, height: this.height });
+  }
+
+  get range() {
+    const { min, max } = this.plot.scales.x;
+    return [min, max];
+  }
+
+  show(min, max) {
+    const [first, last] = this.whole;
+    const span = Math.min(Math.max(max - min, (last - first) * 1e-4), last - first);
+    const low = Math.min(Math.max(min, first), last - span);
+    this.plot.setScale("x", { min: low, max: low + span });
+  }
+
+  zoom(factor, share = 0.5) {
+    const [min, max] = this.range;
+    const at = min + (max - min) * share;
+    this.show(at - (at - min) * factor, at + (max - at) * factor);
+  }
+
+  move(share) {
+    const [min, max] = this.range;
+    this.show(min + (max - min) * share, max + (max - min) * share);
+  }
+
+  // One finger moves along, two fingers zoom; up and down scrolls the page.
+  touch() {
+    const { over } = this.plot;
+    const fingers = new Map();
+    over.addEventListener("pointerdown", (event) => { if (event.pointerType !== "mouse") fingers.set(event.pointerId, event.clientX); });
+    for (const end of ["pointerup", "pointercancel"]) over.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    over.addEventListener("pointermove", (event) => {
+      if (!fingers.has(event.pointerId)) return;
+      const before = [...fingers.values()];
+      fingers.set(event.pointerId, event.clientX);
+      const now = [...fingers.values()];
+      if (now.length === 1) this.move((before[0] - now[0]) / over.clientWidth);
+      else this.zoom(Math.abs(before[0] - before[1]) / Math.max(Math.abs(now[0] - now[1]), 1));
+    });
+    over.addEventListener("wheel", (event) => {
+      if (!event.ctrlKey) return;
+      event.preventDefault();
+      this.zoom(event.deltaY > 0 ? 1.25 : 0.8, event.offsetX / over.clientWidth);
+    }, { passive: false });
+  }
+}
+
+export function axes(values, paintNow, yLabel) {
+  const common = { stroke: paintNow.quiet, grid: { stroke: paintNow.line, width: 1 }, ticks: { stroke: paintNow.line, width: 1 }, font: "12px system-ui, sans-serif" };
+  return [{ ...common, ...(values ? { values } : {}) }, { ...common, label: yLabel, labelFont: "12px system-ui, sans-serif", labelSize: 18, size: 52 }];
+}
+
+function save(blob, name) {
+  const link = document.createElement("a");
+  link.href = URL.createObjectURL(blob);
+  link.download = name;
+  link.click();
+  setTimeout(() => URL.revokeObjectURL(link.href), 1000);
+}
+
+// The canvases one below the other, on the colour of their card.
+export function savePng(name, hosts) {
+  const all = hosts.map((host) => host.querySelector("canvas"));
+  const sheet = document.createElement("canvas");
+  sheet.width = Math.max(...all.map((one) => one.width));
+  sheet.height = all.reduce((sum, one) => sum + one.height, 0);
+  const pen = sheet.getContext("2d");
+  pen.fillStyle = getComputedStyle(hosts[0].closest(".card")).backgroundColor;
+  pen.fillRect(0, 0, sheet.width, sheet.height);
+  let top = 0;
+  for (const one of all) {
+    pen.drawImage(one, 0, top);
+    top += one.height;
+  }
+  sheet.toBlob((blob) => save(blob, `${name}.png`));
+}
+
+export function saveCsv(name, rows) {
+  const cell = (value) => (/[",\n]/.test(value) ? `"${value.replaceAll('"', '""')}"` : value);
+  save(new Blob([rows.map((row) => row.map((one) => cell(String(one ?? ""))).join(",")).join("\n") + "\n"], { type: "text/csv" }), `${name}.csv`);
+}
+
+// ---- the trend of a figure ------------------------------------------------------------------------------------------------------
+
+class Trend {
+  constructor(box, words) {
+    this.box = box;
+    this.words = words;
+    this.told = JSON.parse(box.dataset.plot);
+    this.told.index = new Map(this.told.chart.x.map((at, k) => [at, k]));
+    this.out = box.querySelector("output");
+    this.build();
+    box.querySelector("svg").remove();
+    box.querySelector(".tools").hidden = false;
+    box.addEventListener("click", (event) => this.press(event.target.closest("button")?.dataset.do));
+    box.addEventListener("keydown", (event) => this.key(event));
+  }
+
+  build() {
+    const { told, words } = this;
+    const colours = paint();
+    const date = (at) => uPlot.tzDate(new Date(at * 1e3), told.zone);
+    const days = (u, splits) => splits.map((at) => {
+      const [min, max] = [u.scales.x.min, u.scales.x.max];
+      const [, y, m, d, clock] = /(\d{4})-(\d\d)-(\d\d) (\d\d:\d\d)/.exec(stamp(date(at)));
+      return max - min < 4 * 86400 ? `${m}-${d} ${clock}` : max - min < 700 * 86400 ? `${m}-${d}` : `${y}-${m}`;
+    });
+    const last = told.x.at(-1);
+    const most = told.cone ? Math.min(told.cone.high, last + 0.6 * (last - told.x[0]) + 86400) : last;
+    const margin = Math.max((most - told.x[0]) * 0.03, 60);
+    const ends = [told.x[0] - margin, most + margin];
+    const high = told.y.map((y, k) => y + told.u[k]);
+    const low = told.y.map((y, k) => y - told.u[k]);
+    const limits = told.limit.filter((one) => one !== null);
+    const top = Math.max(...high, ...limits, told.centre ?? -Infinity) * 1.06;
+    const scales = { x: { time: true, range: (_, min, max) => [min, max] }, y: { range: [Math.min(0, ...low), top] } };
+    const main = this.box.querySelector("[data-part=main]");
+    const below = this.box.querySelector("[data-part=chart]");
+    main.replaceChildren();
+    below.replaceChildren();
+    const padded = (list) => [null, ...list, null];
+    this.main = new Plot(main, {
+      scales, tzDate: date, padding: [12, 12, 0, 0],
+      axes: axes(days, colours, `${told.name} [${told.unit}]`),
+      series: [{}, { show: true, stroke: "transparent", points: { show: false } }, { stroke: colours.fail, dash: [6, 4], points: { show: false }, spanGaps: true }],
+      hooks: { drawAxes: [(u) => this.behind(u, colours)], draw: [(u) => this.points(u, colours)], setScale: [(u, key) => key === "x" && this.follow(u)] },
+    }, [[ends[0], ...told.x, ends[1]], padded(told.y), [limits[0] ?? null, ...told.limit, limits.at(-1) ?? null]], 300, (at) => this.tell(at));
+    const of = (list, by) => told.x.map((at) => (told.index.has(at) ? list[told.index.get(at)] / by(told.index.get(at)) : null));
+    const { chart } = told;
+    const ewma = of(chart.ewma.map((one) => one ?? NaN), (k) => chart.ewma_limit[k]).map((one) => (Number.isFinite(one) ? one : null));
+    const curve = (stroke, dash) => ({ stroke, dash, width: 1.5, spanGaps: true, points: { show: false } });
+    this.chart = new Plot(below, {
+      scales: { x: scales.x, y: { range: (_, min, max) => [Math.min(-1.15, min ?? 0), Math.max(1.15, max ?? 0)] } },
+      tzDate: date, padding: [6, 12, 0, 0],
+      axes: axes(days, colours, words["plot.share"]),
+      series: [{}, curve(colours.accent), curve(colours.accent, [2, 3]), curve(colours.unclear)],
+      hooks: { draw: [(u) => inside(u, (pen, x, y, b) => {
+        for (const one of [1, -1]) line(pen, [[b.left, y(one)], [b.left + b.width, y(one)]], colours.fail, { dash: [6, 4] });
+      })] },
+    }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(ewma)], 150, (at) => this.tell(at));
+    this.main.show(...ends);
+  }
+
+  follow(u) {
+    const { min, max } = u.scales.x;
+    if (this.chart && (this.chart.range[0] !== min || this.chart.range[1] !== max)) this.chart.plot.setScale("x", { min, max });
+  }
+
+  // Centre line, forecast and marks lie behind the points.
+  behind(u, colours) {
+    const { told } = this;
+    inside(u, (pen, x, y, b) => {
+      if (told.centre !== null) line(pen, [[x(told.chart.x[0]), y(told.centre)], [b.left + b.width, y(told.centre)]], colours.quiet);
+      if (told.cone) {
+        const { at, value, low, days, high, limit } = told.cone;
+        pen.fillStyle = colours.accent;
+        pen.globalAlpha = 0.18;
+        pen.beginPath();
+        for (const [cx, cy] of [[at, value], [low, limit], [high, limit]]) pen.lineTo(x(cx), y(cy));
+        pen.fill();
+        pen.globalAlpha = 1;
+        line(pen, [[x(at), y(value)], [x(days), y(limit)]], colours.accent, { dash: [8, 4], width: 1.5 });
+      }
+      pen.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
+      pen.textAlign = "center";
+      for (const mark of told.marks) {
+        const bad = mark.kind === "alarm";
+        line(pen, [[x(mark.at), b.top], [x(mark.at), b.top + b.height]], bad ? colours.fail : colours.quiet, { dash: [2, 4], width: 1.5 });
+        pen.fillStyle = bad ? colours.fail : colours.text;
+        pen.fillText(mark.sign, x(mark.at), b.top + 12 * devicePixelRatio);
+      }
+    });
+  }
+
+  points(u, colours) {
+    const { told } = this;
+    const r = devicePixelRatio;
+    inside(u, (pen, x, y) => told.x.forEach((at, k) => {
+      const [px, py] = [x(at), y(told.y[k])];
+      const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
+      pen.globalAlpha = told.earlier[k] ? 0.5 : 1;
+      if (told.u[k]) for (const part of [[[px, top], [px, bottom]], [[px - 4 * r, top], [px + 4 * r, top]], [[px - 4 * r, bottom], [px + 4 * r, bottom]]]) line(pen, part, colours.quiet, { width: 1.2 });
+      const word = VERDICTS[told.verdict[k]];
+      const colour = told.earlier[k] ? colours.quiet : word === "pass" ? colours.pass : word === "fail" ? colours.fail : colours.unclear;
+      if (word === "fail") {
+        line(pen, [[px - 5 * r, py - 5 * r], [px + 5 * r, py + 5 * r]], colour, { width: 2.5 });
+        line(pen, [[px - 5 * r, py + 5 * r], [px + 5 * r, py - 5 * r]], colour, { width: 2.5 });
+      } else {
+        pen.beginPath();
+        if (word === "pass") pen.arc(px, py, 4 * r, 0, 2 * Math.PI);
+        else for (const [dx, dy] of [[0, -5], [5, 0], [0, 5], [-5, 0]]) pen.lineTo(px + dx * r, py + dy * r);
+        pen.closePath();
+        pen.fillStyle = colour;
+        pen.fill();
+      }
+      pen.globalAlpha = 1;
+    }));
+  }
+
+  when(at) {
+    return stamp(uPlot.tzDate(new Date(at * 1e3), this.told.zone));
+  }
+
+  tell(index) {
+    const { told, words } = this;
+    const k = index === null ? -1 : Math.min(Math.max(index - 1, 0), told.x.length - 1);
+    if (k < 0 || k === this.at) return;
+    this.at = k;
+    const c = told.index.get(told.x[k]);
+    const told1 = fill(words["plot.at"], {
+      when: this.when(told.x[k]), value: told.shown[k][0], u: told.shown[k][1], unit: told.unit,
+      verdict: words[`verdict.${VERDICTS[told.verdict[k]]}`], check: told.check[k],
+    });
+    const chart = c === undefined ? "" : ` · CUSUM ↑ ${told.chart.high[c].toFixed(1)} ↓ ${told.chart.low[c].toFixed(1)} (${told.chart.h}) · EWMA ${told.chart.ewma[c] === null ? "–" : told.chart.ewma[c].toFixed(2)}`;
+    const marks = told.marks.filter((mark) => Math.abs(mark.at - told.x[k]) < 43200).map((mark) => ` · ${mark.sign} ${mark.text}`);
+    this.out.textContent = told1 + chart + marks.join("");
+    const link = this.box.querySelector("a.open");
+    link.hidden = false;
+    link.href = `/check?id=${told.check[k]}`;
+    link.textContent = fill(words["check.open"], { n: told.check[k] });
+  }
+
+  key(event) {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    const act = { "+": "in", "-": "out", 0: "whole" }[event.key];
+    if (event.target.closest("button, a") || event.ctrlKey || event.metaKey || event.altKey || !(step || act)) return;
+    event.preventDefault();
+    if (act) return this.press(act);
+    const { x } = this.told;
+    const next = Math.min(Math.max((this.at ?? x.length) + step, 0), x.length - 1);
+    const { plot } = this.main;
+    plot.setCursor({ left: plot.valToPos(x[next], "x"), top: plot.valToPos(this.told.y[next], "y") });
+    this.tell(next + 1);
+  }
+
+  press(what) {
+    const { main, told } = this;
+    if (what === "in") main.zoom(0.5, this.at === undefined ? 1 : (told.x[this.at] - main.range[0]) / (main.range[1] - main.range[0]));
+    if (what === "out") main.zoom(2);
+    if (what === "left") main.move(-0.5);
+    if (what === "right") main.move(0.5);
+    if (what === "whole") main.show(...main.whole);
+    if (what === "png") savePng(told.key, [...this.box.querySelectorAll("[data-part]")]);
+    if (what === "csv") saveCsv(told.key, this.rows());
+  }
+
+  rows() {
+    const { told } = this;
+    const head = ["check", "time", `${told.key} [${told.unit}]`, `U (k=2) [${told.unit}]`, `limit [${told.unit}]`, "verdict", "CUSUM high", "CUSUM low", "EWMA"];
+    return [head, ...told.x.map((at, k) => {
+      const c = told.index.get(at);
+      const chart = c === undefined ? ["", "", ""] : [told.chart.high[c], told.chart.low[c], told.chart.ewma[c]];
+      return [told.check[k], new Date(at * 1e3).toISOString(), told.y[k], told.u[k] || "", told.limit[k], VERDICTS[told.verdict[k]], ...chart];
+    })];
+  }
+}
+
+// A date that `tzDate` shifted to the zone, as on the other screens.
+function stamp(date) {
+  const two = (n) => String(n).padStart(2, "0");
+  return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} ${two(date.getHours())}:${two(date.getMinutes())}`;
+}
+
+const list = document.getElementById("trend-plots");
+if (list && uPlot) {
+  const words = JSON.parse(list.dataset.words);
+  const all = [...list.querySelectorAll("[data-plot]")].map((box) => new Trend(box, words));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => all.forEach((one) => one.build()));
+  document.documentElement.dataset.plotted = "yes";
+}
