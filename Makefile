@@ -89,19 +89,19 @@ $(BIN)/python:
 	@$(PYTHON) -m venv $(VENV) \
 	|| { rm -rf $(VENV); echo "'$(PYTHON) -m venv' failed (see above); on Debian and Ubuntu it needs the package python3-venv."; exit 1; }
 
-$(RUN_READY): requirements.lock pyproject.toml deploy/uplot.py | $(BIN)/python
+$(RUN_READY): requirements.lock pyproject.toml deploy/npm_files.py | $(BIN)/python
 	@echo "setting up .venv from requirements.lock, about a minute"
 	@$(PIP) --require-hashes -r requirements.lock
 	@$(PIP) --no-deps --no-build-isolation -e .
-	@$(BIN)/python deploy/uplot.py || true
+	@$(BIN)/python deploy/npm_files.py uplot || true
 	@touch $@
 
 # The developers' lock holds everything of the users' lock (a test sees to it), so the second stamp is due as well.
-$(DEV_READY): requirements-dev.lock requirements.lock pyproject.toml deploy/uplot.py | $(BIN)/python
+$(DEV_READY): requirements-dev.lock requirements.lock pyproject.toml deploy/npm_files.py | $(BIN)/python
 	@echo "setting up .venv from requirements-dev.lock, about a minute"
 	@$(PIP) --require-hashes -r requirements-dev.lock
 	@$(PIP) --no-deps --no-build-isolation -e .
-	@$(BIN)/python deploy/uplot.py || true
+	@$(BIN)/python deploy/npm_files.py || true
 	@touch $(RUN_READY) $@
 
 # The libraries that we compare with are no business of the product's environment.

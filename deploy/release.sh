@@ -13,15 +13,16 @@ grep -qx "version: $version" CITATION.cff || { echo "release: CITATION.cff does 
 grep -q '^## Unreleased$' CHANGELOG.md || grep -q "^## $version " CHANGELOG.md || { echo "release: CHANGELOG.md does not tell of $version" >&2; exit 1; }
 SOURCE_DATE_EPOCH="$(git log -1 --format=%ct 2>/dev/null || echo 1767225600)"
 export SOURCE_DATE_EPOCH
-"$tools/python" deploy/uplot.py
+"$tools/python" deploy/npm_files.py
 scratch="$(mktemp -d)"
 trap 'rm -rf "$scratch"' EXIT
 
-# Built twice, each from what git has, and uPlot: the same bytes prove that nothing of this computer is in them.
+# Built twice, each from what git and npm have: the same bytes prove that nothing of this computer is in them.
 for n in 1 2; do
     mkdir "$scratch/$n"
     git archive HEAD | tar -x -C "$scratch/$n"
     cp -r service/web/static/uplot "$scratch/$n/service/web/static/"
+    cp -r service/plant/opcua/nodesets "$scratch/$n/service/plant/opcua/"
     (cd "$scratch/$n" && umask 022 && "$OLDPWD/$tools/python" -m build --no-isolation --wheel . >../build.log 2>&1) || { cat "$scratch/build.log" >&2; exit 1; }
 done
 cmp "$scratch"/1/dist/*.whl "$scratch"/2/dist/*.whl

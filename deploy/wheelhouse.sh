@@ -17,7 +17,7 @@ pip=("$part/venv/bin/python" -m pip --quiet --disable-pip-version-check --no-inp
 "${pip[@]}" download --require-hashes --no-deps --only-binary :all: -d "$part/wheels" -r requirements.lock -r deploy/requirements-postgres.lock
 # Abbe itself is built with the setuptools of the lock.
 "${pip[@]}" install --upgrade --no-index --no-deps "$part"/wheels/setuptools-*.whl
-"$part/venv/bin/python" deploy/uplot.py
+"$part/venv/bin/python" deploy/npm_files.py
 rm -rf build  # setuptools would pack what an older wheel has left there
 "${pip[@]}" wheel --no-index --no-deps --no-build-isolation -w "$part/wheels" .
 rm -rf "$part/venv"

@@ -5,8 +5,10 @@ A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the ex
     opc.tcp://192.168.0.40:4840/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ&moving=ns%3D2%3Bs%3DMoving&unit=mm
 
 ``moving`` (a Boolean; optional) tells a standstill. The unit is that of the nodes' EngineeringUnits (UNECE code); ``unit`` (mm, um, m, in)
-states it where they have none, and is refused where they contradict it. A value whose quality is not good is refused. Anonymous, without
-encryption: for a network of the machine's own.
+states it where they have none, and is refused where they contradict it. A value whose quality is not good is refused.
+
+Without more the session is anonymous and not encrypted: for a network of the machine's own. ``certificate``, ``key`` (PEM, ours) and
+``server`` (the server's, DER or PEM) encrypt it by Basic256Sha256, and no other server is spoken to; ``user`` and ``password_file`` log in.
 """
 
 from __future__ import annotations
@@ -14,6 +16,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import Awaitable
+from pathlib import Path
 from typing import Any, TypeVar
 from urllib.parse import parse_qsl, urlsplit, urlunsplit
 
@@ -189,13 +192,12 @@ async def open_opcua(url: str) -> OpcUaControl:
     LinkDown, ReplyTimeout, BadFrame
         Communication failed.
     """
-    parts = urlsplit(url)
-    query = dict(parse_qsl(parts.query))
+    query, access = _split(url)
     unit = query.pop("unit", "")
-    if not set(AXES) <= set(query) <= {*AXES, "moving"} or unit not in ("", *MM) or not parts.hostname:
+    if not set(AXES) <= set(query) <= {*AXES, "moving"} or unit not in ("", *MM) or not urlsplit(url).hostname:
         remedy = "opc.tcp://HOST:PORT/?x=NODE&y=NODE&z=NODE, if need be &moving=NODE and &unit=mm, um, m or in; a node: ns%3D2%3Bs%3DX"
         raise BadUrl(ascii(url), "read device URL", "nodes of X, Y and Z are needed", remedy)
-    client = await _connected(url)
+    client = await _connected(url, access)
     try:
         return OpcUaControl(url, client, query, unit)
     except ValueError as error:
@@ -212,23 +214,78 @@ async def open_files(url: str) -> OpcUaFiles:
     LinkDown, ReplyTimeout, BadFrame
         Communication failed.
     """
-    query = dict(parse_qsl(urlsplit(url).query))
+    query, access = _split(url)
     if not query:
         raise BadUrl(ascii(url), "read URL", "it names no file", "opc.tcp://HOST:PORT/?NAME=NODE, a node: ns%3D2%3Bs%3DTable")
-    client = await _connected(url)
+    client = await _connected(url, access)
     try:
         return OpcUaFiles(url, client, query)
     except ValueError as error:
         raise await _bad_node(url, client, error) from None
 
 
-async def _connected(url: str) -> Any:
+SECRETS = ("certificate", "key", "server")
+"""Files that encrypt a session: all or none."""
+LOGIN = ("user", "password_file")
+
+
+def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
+    """Return the nodes of a URL, and the files and names of its session."""
+    query = dict(parse_qsl(urlsplit(url).query))
+    access = {key: query.pop(key) for key in (*SECRETS, *LOGIN) if key in query}
+    wrong = ""
+    if 0 < len(access.keys() & set(SECRETS)) < len(SECRETS):
+        wrong = "certificate, key and server need each other"
+    elif len(access.keys() & set(LOGIN)) == 1:
+        wrong = "user and password_file need each other"
+    elif "user" in access and "key" not in access:
+        wrong = "a password is sent over an encrypted session only: certificate, key and server are missing"
+    missing = [path for key, path in access.items() if key != "user" and not Path(path).is_file()]
+    if wrong or missing:
+        raise BadUrl(ascii(url), "read device URL", wrong or f"{missing[0]}: no such file", "&certificate=FILE&key=FILE&server=FILE")
+    return query, access
+
+
+async def _secured(client: Any, url: str, access: dict[str, str]) -> None:
+    """Encrypt a session and log in, as the URL wants it."""
+    from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
+
+    try:
+        client.application_uri = _application_uri(access["certificate"])
+        await client.set_security(SecurityPolicyBasic256Sha256, access["certificate"], access["key"], server_certificate=access["server"])
+    except (ValueError, TypeError, IndexError, OSError) as error:
+        remedy = "PEM files; our certificate needs a URI among its alternative names"
+        raise BadUrl(ascii(url), "open device", f"certificate or key: {error}", remedy) from None
+    if "user" in access:
+        client.set_user(access["user"])
+        client.set_password(_first_line(access["password_file"]))
+
+
+def _application_uri(certificate: str) -> str:
+    from cryptography import x509
+
+    try:
+        names = x509.load_pem_x509_certificate(Path(certificate).read_bytes()).extensions.get_extension_for_class(
+            x509.SubjectAlternativeName
+        )
+    except x509.ExtensionNotFound as missing:
+        raise ValueError(f"{certificate}: {missing}") from None
+    return names.value.get_values_for_type(x509.UniformResourceIdentifier)[0]
+
+
+def _first_line(path: str) -> str:
+    return Path(path).read_text(encoding="utf-8").partition("\n")[0]
+
+
+async def _connected(url: str, access: dict[str, str]) -> Any:
     try:
         from asyncua import Client
     except ImportError:
         raise BadUrl(ascii(url), "open device", "OPC UA is not installed", "pip install 'abbe[opcua]'") from None
     parts = urlsplit(url)
     client = Client(urlunsplit((parts.scheme, parts.netloc, parts.path, "", "")), timeout=ANSWER_S)
+    if "certificate" in access:
+        await _secured(client, url, access)
     await _answered(url, "connect", client.connect())
     return client
 

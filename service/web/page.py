@@ -54,7 +54,7 @@ ICON = (
 
 
 def has_uplot() -> bool:
-    """Whether the library for curves that can be zoomed was fetched (deploy/uplot.py)."""
+    """Whether the library for curves that can be zoomed was fetched (deploy/npm_files.py)."""
     return (HERE / "static" / "uplot" / "uPlot.iife.min.js").exists()
 
 

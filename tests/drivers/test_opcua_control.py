@@ -6,6 +6,7 @@ import importlib
 import socket
 import tomllib
 from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from dataclasses import dataclass, field
 from importlib.metadata import EntryPoint
 from pathlib import Path
@@ -16,14 +17,20 @@ import pytest
 pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
 
 from asyncua import Server, ua
+from asyncua.crypto.permission_rules import User, UserRole
+from asyncua.server.user_managers import UserManager
+from cryptography import x509
+from cryptography.hazmat.primitives.serialization import Encoding
 
 from abbe.drivers.api import Condition, only_listens
-from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, NotProved, WrongDevice
+from abbe.drivers.errors import BadFrame, BadUrl, DeviceFault, LinkDown, NotProved, ReplyTimeout, WrongDevice
 from abbe.drivers.opcua_control import DRIVER, MM, UNECE, OpcUaControl, open_files
 from abbe.service.devices.session import open_session
+from tests.certificates import Signed, issued
 from tests.service.devices.test_second_controller import machine_with
 
 ROOT = Path(__file__).resolve().parents[2]
+MILL = "urn:mill:server"
 X, Y, Z, MOVING, FILE = ("ns=2;s=" + name for name in ("X", "Y", "Z", "Moving", "Table"))
 
 
@@ -67,15 +74,23 @@ async def _file(plant: Plant, index: int) -> None:
         await node.add_method(ua.NodeId(f"Table.{name}", index), ua.QualifiedName(name, 0), does)
 
 
-@pytest.fixture
-async def plant() -> AsyncIterator[Plant]:
+@asynccontextmanager
+async def serving(own: Signed | None = None, client: Signed | None = None) -> AsyncIterator[Plant]:
+    """A control's server; ``own``: encrypted only, for ``client`` and the user of `_OneUser`."""
     with socket.create_server(("127.0.0.1", 0)) as held:
         port = held.getsockname()[1]
-    server = Server()
+    server = Server(user_manager=_OneUser(client.pem) if client else None)
     await server.init()
     url = f"opc.tcp://127.0.0.1:{port}/"
     server.set_endpoint(url)
-    server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    if own is None:
+        server.set_security_policy([ua.SecurityPolicyType.NoSecurity])
+    else:
+        await server.set_application_uri(MILL)
+        server.set_security_policy([ua.SecurityPolicyType.Basic256Sha256_SignAndEncrypt])
+        server.set_identity_tokens([ua.UserNameIdentityToken])
+        await server.load_certificate(str(own.pem))
+        await server.load_private_key(str(own.key_pem))
     index = await server.register_namespace("urn:mill")
     plant = Plant(server, url)
     for name, value in (("X", 1.5), ("Y", -20.0), ("Z", 300.25), ("Moving", False)):
@@ -86,6 +101,22 @@ async def plant() -> AsyncIterator[Plant]:
             await node.add_property(ua.NodeId(f"{name}.unit", index), ua.QualifiedName("EngineeringUnits", 0), unit)
     await _file(plant, index)
     async with server:
+        yield plant
+
+
+class _OneUser(UserManager):
+    """Knows one user, on a channel of one certificate."""
+
+    def __init__(self, pem: Path) -> None:
+        self.der = x509.load_pem_x509_certificate(pem.read_bytes()).public_bytes(Encoding.DER)
+
+    def get_user(self, iserver: Any, username: str | None = None, password: Any = None, certificate: Any = None) -> User | None:
+        return User(role=UserRole.User) if (username, password) == ("abbe", "bar ball") else None
+
+
+@pytest.fixture
+async def plant() -> AsyncIterator[Plant]:
+    async with serving() as plant:
         yield plant
 
 
@@ -124,6 +155,46 @@ async def test_positions_are_read_with_unit_and_quality(plant: Plant) -> None:
         await control.close()
     with pytest.raises(WrongDevice, match="X is in mm; stated is in"):
         await _open(plant.asked("in"))
+
+
+def secured(url: str, ours: Signed, server: Path, password: Path) -> str:
+    return f"{url}&certificate={ours.pem}&key={ours.key_pem}&server={server}&user=abbe&password_file={password}"
+
+
+async def test_an_encrypted_control_with_users_is_read_and_no_other_server_is_spoken_to(tmp_path: Path) -> None:
+    mill = issued(tmp_path, "mill", None, addresses=("127.0.0.1",), uri=MILL)
+    ours = issued(tmp_path, "abbe", None, uri="urn:abbe:mill-7")
+    other = issued(tmp_path, "other", None, addresses=("127.0.0.1",), uri=MILL)
+    right, wrong = tmp_path / "right", tmp_path / "wrong"
+    right.write_text("bar ball\n")
+    wrong.write_text("ball bar\n")
+    async with serving(mill, ours) as plant:
+        control = await _open(secured(plant.asked(), ours, mill.pem, right))
+        try:
+            assert (await control.status()).position_mm == (1.5, -20.0, 300.25)
+        finally:
+            await control.close()
+        for url in (secured(plant.asked(), ours, mill.pem, wrong), secured(plant.asked(), ours, other.pem, right), plant.asked()):
+            with pytest.raises((BadFrame, LinkDown, ReplyTimeout)):
+                await _open(url)
+
+
+@pytest.mark.parametrize(
+    ("more", "words"),
+    [
+        ("&certificate={0}", "certificate, key and server need each other"),
+        ("&user=abbe", "user and password_file need each other"),
+        ("&user=abbe&password_file={0}", "over an encrypted session only"),
+        ("&certificate={0}&key={0}&server=gone.der", "gone.der: no such file"),
+        ("&certificate={0}&key={0}&server={0}", "certificate or key:"),
+    ],
+)
+async def test_a_session_that_is_half_secured_is_refused_before_anything_is_sent(tmp_path: Path, more: str, words: str) -> None:
+    file = tmp_path / "file"
+    file.write_text("no certificate")
+    nodes = "opc.tcp://127.0.0.1:1/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ"
+    with pytest.raises(BadUrl, match=words):
+        await DRIVER["cnc"](nodes + more.format(file))
 
 
 async def test_a_file_is_put_into_it_and_read_back(plant: Plant) -> None:

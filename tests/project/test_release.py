@@ -36,14 +36,16 @@ def test_licence_and_notice_are_the_whole_texts() -> None:
     assert supported == {"3.11", "3.12", "3.13", "3.14"}
 
 
-def test_the_wheel_carries_one_library_of_others_with_its_licence() -> None:
-    """NOTICE says so: no fonts, and no scripts that somebody else wrote but uPlot, where it was fetched."""
-    foreign = re.compile(r"\.(ttf|otf|woff2?|min\.js|min\.css)$")
+def test_the_wheel_carries_two_packages_of_others_with_their_licences() -> None:
+    """NOTICE says so: no fonts, and nothing that somebody else wrote but uPlot and nodesets of OPC UA, where they were fetched."""
+    foreign = re.compile(r"\.(ttf|otf|woff2?|min\.js|min\.css|xml)$")
     parts = [ROOT / part for part in ("service", "drivers", "models", "simulators")]
     found = {path for part in parts for path in part.rglob("*") if foreign.search(path.name)}
-    assert {path.parent for path in found} <= {ROOT / "service" / "web" / "static" / "uplot"}
+    folders = ("service/web/static/uplot", "service/plant/opcua/nodesets")
+    assert {path.parent for path in found} <= {ROOT / folder for folder in folders}
     assert all("Copyright" in (path.parent / "LICENSE").read_text(encoding="utf-8") for path in found)
-    assert subprocess.run(["git", "check-ignore", "-q", "service/web/static/uplot"], cwd=ROOT, check=False).returncode in {0, 128}
+    for folder in folders:
+        assert subprocess.run(["git", "check-ignore", "-q", folder], cwd=ROOT, check=False).returncode in {0, 128}
 
 
 @pytest.fixture(scope="module")

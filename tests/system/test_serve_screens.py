@@ -346,7 +346,7 @@ def test_the_map_of_the_volume_is_turned_zoomed_and_asked(chromium, running, axe
 
 def test_a_trend_is_zoomed_read_and_taken_along(chromium, running, axe) -> None:
     if not has_uplot():
-        pytest.skip("uPlot was not fetched (deploy/uplot.py)")
+        pytest.skip("uPlot was not fetched (deploy/npm_files.py)")
     with context(chromium, "1024", "dark") as made:
         page = made.new_page()
         watch = Watch(page, running.base)

@@ -30,6 +30,7 @@ from abbe.service.clock import Clock
 from abbe.service.config_schema import OpcUa
 from abbe.service.errors import ConfigError, StoreError
 from abbe.service.plant.gather import FactsSource
+from abbe.service.plant.opcua.events import Events
 from abbe.service.plant.opcua.setup import in_force, trusted
 from abbe.service.plant.opcua.space import NAMESPACE, Space, picture_of
 
@@ -176,7 +177,7 @@ class OpcUaServer:
         self.listening = asyncio.Event()
         self.sealed = 0
         """Number of write and execute rights removed from the standard's own nodes."""
-        self._built: tuple[Server, Space] | None = None
+        self._built: tuple[Server, Space, Events] | None = None
 
     async def prepare(self) -> None:
         """Build the address space. Call it before anything moves: it takes 1 to 2 s and blocks the event loop for parts of a second."""
@@ -196,7 +197,7 @@ class OpcUaServer:
         if self._setup.port:  # fail now rather than after a second of building the address space, at every attempt
             family = socket.AF_INET6 if ":" in self._setup.host else socket.AF_INET
             socket.create_server((self._setup.host, self._setup.port), family=family).close()
-        server, space = self._built or await self._build()
+        server, space, events = self._built or await self._build()
         self._built = None
         await server.start()
         try:
@@ -206,19 +207,20 @@ class OpcUaServer:
             self.listening.set()
             while not stop.is_set():
                 await self._pause(PERIOD_S, stop)
-                await self._show(space)
+                await self._show(space, events)
                 await self._tell_time(server)
         finally:
             self.listening.clear()
             self.port = 0
             await server.stop()
 
-    async def _build(self) -> tuple[Server, Space]:
+    async def _build(self) -> tuple[Server, Space, Events]:
         server = await self._make()
-        space = Space(server, await server.register_namespace(NAMESPACE), self._machine)
-        await self._show(space)
+        space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine)
+        events = await Events.prepared(server, space.types, space.root)
+        await self._show(space, events)
         self.sealed = seal(server.iserver.aspace)
-        return server, space
+        return server, space, events
 
     async def _make(self) -> Server:
         setup = self._setup
@@ -243,7 +245,7 @@ class OpcUaServer:
                 raise ConfigError(f"[opcua] certificate {setup.certificate}, key {setup.key}: {wrong}", "give PEM files") from None
         return server
 
-    async def _show(self, space: Space) -> None:
+    async def _show(self, space: Space, events: Events) -> None:
         try:
             facts = await self._source.facts()
         except StoreError as trouble:
@@ -251,6 +253,7 @@ class OpcUaServer:
                 log.warning("facts not available; the last known values are shown and marked as such", reason=trouble.detail)
             return
         await space.show(picture_of(facts), facts.now_utc)
+        await events.show(facts)
 
     async def _tell_time(self, server: Server) -> None:
         now: datetime = self._clock.utc()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import UTC, datetime
 from typing import Literal
 
 from asyncua import Node, Server, ua
+from asyncua.common.instantiate_util import instantiate
 
+from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.verification import Verification
 from abbe.service.plant.gather import PlantAlarm, PlantFacts, PlantUnit, unit_of
+from abbe.service.plant.opcua.types import Types, add_types, variables_under
 
 Value = str | bool | int | float | datetime | list[str] | list[datetime] | None
 Kind = Literal["text", "flag", "count", "real", "time", "texts", "times"]
@@ -143,14 +146,44 @@ _TYPES: dict[Kind, tuple[ua.VariantType, int]] = {
 }
 
 
-class Space:
-    """The machine's part of the address space; ``index``: index of Abbe's namespace."""
+ANY = PlantFacts("", "", datetime.fromtimestamp(0, UTC), None, None, (), (), (DeviceStatus(role="*", url="", state="not used yet"),))
+"""A machine of which nothing is known: its picture holds the variables of the types."""
+RUNNING = ("Running", "Production/ActiveProgram/State/CurrentState", "Production/ActiveProgram/Name")
+"""A state of OPC 40501-1, the variable that holds it, and that of the program's name."""
 
-    def __init__(self, server: Server, index: int, machine: str) -> None:
+
+class Space:
+    """The machine's part of the address space; make it with `Space.built`."""
+
+    def __init__(self, server: Server, index: int, machine: str, types: Types) -> None:
         self._server, self._index, self._machine = server, index, machine
+        self.types = types
         self._nodes: dict[str, Node] = {}
+        self._companion: dict[str, Node] = {}
         self._shown: Picture = {}
         self._stale = False
+
+    @classmethod
+    async def built(cls, server: Server, index: int, machine: str) -> Space:
+        """Add the types and the machine; ``index``: index of Abbe's namespace."""
+        variables = [(path, ua.NodeId(_TYPES[leaf.kind][1])) for path, leaf in picture_of(ANY).items()]
+        space = cls(server, index, machine, await add_types(server, index, variables))
+        await space._add_machine()
+        return space
+
+    @property
+    def root(self) -> Node:
+        """The machine's node."""
+        return self._nodes[""]
+
+    async def _add_machine(self) -> None:
+        parent, kind = (self._server.get_node(one) for one in (self.types.parent, self.types.of("")))
+        name = ua.QualifiedName(self._machine, self._index)
+        (node, *_) = await instantiate(parent, kind, self._id(""), name, ua.LocalizedText(self._machine), instantiate_optional=False)
+        self._nodes[""] = node
+        self._companion = await variables_under(node)
+        for variable in self._companion.values():  # what the standard wants and Abbe does not know has no value
+            await self._server.write_attribute_value(variable.nodeid, _data(Leaf(None, "text"), datetime.now(UTC)))
 
     async def show(self, picture: Picture, now: datetime) -> int:
         """Write changed values; return how many. Values missing from the picture become unknown."""
@@ -160,7 +193,18 @@ class Space:
             node = self._nodes.get(path) or await self._make(path, leaf)
             await self._server.write_attribute_value(node.nodeid, _data(leaf, now))
         self._shown, self._stale = {**picture, **gone}, False
+        if self._companion:
+            await self._show_program(picture, now)
         return len(changed)
+
+    async def _show_program(self, picture: Picture, now: datetime) -> None:
+        """A running check is the machine's active program; what the machine runs otherwise is not known."""
+        running, (state, at, name) = picture["Check/Active"].value, RUNNING
+        recipe = picture["Check/Recipe"]
+        await self._server.write_attribute_value(self._companion[name].nodeid, _data(recipe, now))
+        value = ua.Variant(ua.LocalizedText(state)) if running else ua.Variant(None, ua.VariantType.Null)
+        status = ua.StatusCode(ua.StatusCodes.Good if running else ua.StatusCodes.BadNoData)
+        await self._server.write_attribute_value(self._companion[at].nodeid, ua.DataValue(value, status, now, now))
 
     async def show_stale(self, now: datetime) -> bool:
         """Mark every value as the last known one; return False if they were marked before."""
@@ -174,18 +218,26 @@ class Space:
             await self._server.write_attribute_value(self._nodes[path].nodeid, value)
         return True
 
-    async def _folder(self, path: str) -> Node:
-        if path in self._nodes:
-            return self._nodes[path]
-        above, _, name = path.rpartition("/")
-        parent = self._server.nodes.objects if not path else await self._folder(above)
-        node = await parent.add_object(self._id(path), ua.QualifiedName(name or self._machine, self._index))
-        self._nodes[path] = node
-        return node
+    async def _object(self, path: str) -> Node:
+        if path not in self._nodes:
+            above, _, name = path.rpartition("/")
+            item = ua.AddNodesItem()
+            item.RequestedNewNodeId, item.BrowseName = self._id(path), ua.QualifiedName(name, self._index)
+            item.NodeClass, item.ParentNodeId = ua.NodeClass.Object, (await self._object(above)).nodeid
+            item.ReferenceTypeId = ua.NodeId(ua.ObjectIds.HasComponent)
+            item.TypeDefinition = self.types.of(path)
+            item.NodeAttributes = ua.ObjectAttributes(DisplayName=ua.LocalizedText(name), Description=ua.LocalizedText(name))
+            self._nodes[path] = await self._add(item)
+        return self._nodes[path]
+
+    async def _add(self, item: ua.AddNodesItem) -> Node:
+        (result,) = await self._server.iserver.isession.add_nodes([item])
+        result.StatusCode.check()
+        return self._server.get_node(item.RequestedNewNodeId)
 
     async def _make(self, path: str, leaf: Leaf) -> Node:
         above, _, name = path.rpartition("/")
-        parent = await self._folder(above)
+        parent = await self._object(above)
         _, datatype = _TYPES[leaf.kind]
         item = ua.AddNodesItem()
         item.RequestedNewNodeId, item.BrowseName = self._id(path), ua.QualifiedName(name, self._index)
@@ -199,9 +251,7 @@ class Space:
         attributes.AccessLevel = attributes.UserAccessLevel = ua.AccessLevel.CurrentRead.mask
         attributes.Value = ua.Variant()
         item.NodeAttributes = attributes
-        (result,) = await self._server.iserver.isession.add_nodes([item])
-        result.StatusCode.check()
-        node = self._nodes[path] = self._server.get_node(self._id(path))
+        node = self._nodes[path] = await self._add(item)
         if leaf.unit is not None:
             await node.add_property(self._id(f"{path}.EngineeringUnits"), ua.QualifiedName("EngineeringUnits", 0), _engineering(leaf.unit))
         return node

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
@@ -16,6 +17,7 @@ from tests.patience import within
 pytest.importorskip("asyncua", reason="the extra [opcua] is not installed")
 
 from asyncua import Client, Node, ua
+from asyncua.common.events import Event
 from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 from asyncua.server.address_space import NodeData, NodeManagementService
 from asyncua.server.standard_address_space import standard_address_space
@@ -24,14 +26,19 @@ from asyncua.ua.uaerrors import UaStatusCodeError
 from abbe.service.clock import SystemClock
 from abbe.service.config_schema import OpcUa
 from abbe.service.errors import ConfigError
+from abbe.service.plant.gather import PlantAlarm
 from abbe.service.plant.opcua import server as served
+from abbe.service.plant.opcua import types
 from abbe.service.plant.opcua.server import OpcUaServer
 from abbe.service.plant.opcua.setup import check_opcua
 from tests.certificates import Signed, issued
-from tests.service.plant.facts_for_tests import RUNNING, Source, check, facts
+from tests.conftest import Require
+from tests.service.plant.facts_for_tests import NOON, RUNNING, Source, check, facts
 
 BASE = "ns=2;s=mill-7"
 CLIENT_URI = "urn:plant:scada"
+DI = "http://opcfoundation.org/UA/DI/"
+ALARM = PlantAlarm("ALM-001", "body diagonal above its limit", NOON)
 
 
 @asynccontextmanager
@@ -159,6 +166,96 @@ async def test_what_is_shown_follows_the_facts(source: Source) -> None:
         await subscription.delete()
 
 
+NODESETS = types.NODESETS
+
+
+@pytest.fixture(autouse=True)
+def _standard_types_only(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """Reading the companion specifications takes a second of each start: only tests that ask for them have them."""
+    monkeypatch.setattr(types, "NODESETS", tmp_path)
+
+
+@pytest.fixture(params=[True, False], ids=["companion specifications", "standard types only"])
+def companions(require: Require, request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> bool:
+    if request.param:
+        require("nodesets", (NODESETS / types.COMPANIONS[-1]).is_file(), "deploy/npm_files.py did not fetch them")
+        monkeypatch.setattr(types, "NODESETS", NODESETS)
+    return bool(request.param)
+
+
+async def test_a_client_knows_the_machine_by_its_types(source: Source, companions: bool) -> None:
+    source.now = facts(running=RUNNING)
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
+        machine = client.get_node(BASE)
+        kind = client.get_node(await machine.read_type_definition())
+        above = await (await kind.get_parent()).read_browse_name()
+        where = await (await machine.get_parent()).read_browse_name()
+        assert (await kind.read_browse_name()).Name == "VerifiedMachineType"
+        assert (above.Name, where.Name) == (("MachineToolType", "Machines") if companions else ("BaseObjectType", "Objects"))
+        for path, name in {
+            "LastResult": "CheckResultType",
+            "Devices/cnc": "DeviceConnectionType",
+            "LastResult/Limits": "FolderType",
+        }.items():
+            assert await type_name(client, path) == name
+        declared = {(await one.read_browse_name()).Name for one in await client.get_node(await type_of(client, "Check")).get_children()}
+        shown = {(await one.read_browse_name()).Name for one in await client.get_node(f"{BASE}/Check").get_children()}
+        assert declared == shown
+        if companions:
+            uris = [await client.get_namespace_index(uri) for uri in (DI, types.MACHINE_TOOL)]
+            program = await machine.get_child([f"{uris[1]}:Production", f"{uris[1]}:ActiveProgram", f"{uris[1]}:Name"])
+            serial = await machine.get_child([f"{uris[0]}:Identification", f"{uris[0]}:SerialNumber"])
+            assert await program.read_value() == "quick-check"
+            assert (await serial.read_data_value(raise_on_bad_status=False)).StatusCode.name == "BadNoData", "not known, so not invented"
+
+
+async def type_of(client: Client, path: str) -> ua.NodeId:
+    return await client.get_node(f"{BASE}/{path}").read_type_definition()
+
+
+async def type_name(client: Client, path: str) -> str:
+    return (await client.get_node(await type_of(client, path)).read_browse_name()).Name
+
+
+class Heard:
+    """Collects events, as a real client gets them."""
+
+    def __init__(self) -> None:
+        self.events: asyncio.Queue[Event] = asyncio.Queue()
+
+    def event_notification(self, event: Event) -> None:
+        self.events.put_nowait(event)
+
+    async def next(self) -> Event:
+        async with asyncio.timeout(within(20)):
+            return await self.events.get()
+
+
+@pytest.mark.parametrize("emitter", ["i=2253", BASE], ids=["at the server", "at the machine"])
+async def test_a_check_that_ended_and_a_new_alarm_are_events(source: Source, companions: bool, emitter: str) -> None:
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
+        heard = Heard()
+        subscription = await client.create_subscription(20, heard)
+        kinds = [one for path in ("CheckResultEventType", "AlarmEventType") for one in [await event_type(client, path, companions)]]
+        await subscription.subscribe_events(client.get_node(emitter), kinds)
+        await source.asked_again()
+        assert heard.events.empty(), "what was known at the start is no news"
+        source.now = facts(checks=(check(3, "fail", straightness_um=4.0), check(2, "fail")), alarms=(ALARM, *facts().alarms))
+        result, alarm = await heard.next(), await heard.next()
+        assert (result.Number, result.Verdict, result.Recipe, result.Severity) == (3, "fail", "quick-check", 800)
+        assert (json.loads(result.Figures), result.Message.Text) == ({"straightness_um": [4.0, 1.1, 20.0]}, "check 3: fail")
+        assert (alarm.Code, alarm.Message.Text, alarm.SourceName) == ("ALM-001", "body diagonal above its limit", "mill-7")
+        await source.asked_again()
+        assert heard.events.empty(), "each once"
+
+
+async def event_type(client: Client, name: str, companions: bool) -> Node:
+    base = client.nodes.base_event_type
+    if companions:
+        base = client.get_node(ua.NodeId(types.NOTIFICATION_EVENT_TYPE, await client.get_namespace_index(types.MACHINE_TOOL)))
+    return await base.get_child(f"2:{name}")
+
+
 async def every_node(client: Client) -> list[tuple[ua.NodeId, ua.NodeClass]]:
     """All nodes that can be reached from the root, by browsing a hundred at a time."""
     root = client.nodes.root.nodeid
@@ -181,12 +278,12 @@ async def every_node(client: Client) -> list[tuple[ua.NodeId, ua.NodeClass]]:
     return list(known.items())
 
 
-async def test_no_node_can_be_written_and_no_method_called(source: Source) -> None:
+async def test_no_node_can_be_written_and_no_method_called(source: Source, companions: bool) -> None:
     async with running(OpcUa(port=0), source) as part, client_of(part) as client:
         nodes = await every_node(client)
         ours = [nodeid for nodeid, _ in nodes if nodeid.NamespaceIndex == 2]
         assert len(ours) > 60
-        assert len(nodes) > 3000
+        assert len(nodes) > (4000 if companions else 3000)
 
         refused = 0
         for start in range(0, len(nodes), 100):

