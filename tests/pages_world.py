@@ -301,6 +301,7 @@ def screens(filled: Filled) -> list[str]:
     runs = [f"/run?id={n}" for n in (1, 8, 18)]
     proposals = [f"/proposal?id={n}" for n in filled.proposals[::2]]
     found = [f"/result?id={filled.solution}", f"/discovery?id={filled.discovery}"]
+    found += [f"/motions?id={filled.solution}", f"/motions?id={filled.solution}&motion=EXY", f"/motions?id={filled.solution}&motion=C0Y"]
     found += [f"/volume?id={filled.solution}", f"/volume?id={filled.solution}&motion=EYY&plane=XZ", f"/budget?id={filled.solution}"]
     found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=2&run=3"]
     plant = ["/fleet", "/devices", "/settings"]

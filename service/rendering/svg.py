@@ -61,6 +61,11 @@ class Svg:
             (x, y), (w, h) = _pair(corner), _pair((abs(size[0]), abs(size[1])))
             self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="{_attr(style)}"{_close("rect", tip)}')
 
+    def link(self, corner: XY, size: XY, href: str) -> None:
+        """Area over what is drawn that a script of the page leads on from; links for the keyboard stand beside the picture."""
+        (x, y), (w, h) = _pair(corner), _pair(size)
+        self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="leads" fill-opacity="0" data-href="{_attr(href)}"/>')
+
     def circle(self, centre: XY, radius: float, style: str) -> None:
         """Circle outline."""
         if _finite(centre, (radius, 0.0)):

@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 
 import numpy as np
 
+from abbe.models.arrays import F1, F2
 from abbe.models.compensation.additive import SCALE_NOTE, mean_linear
-from abbe.models.geometry.bases import term_values
+from abbe.models.geometry.bases import Term, term_values
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.service.domain.solution_file import SolutionFile
@@ -157,21 +158,25 @@ def _residuals(found: Assessment) -> list[Block]:
 
 
 def motion_curves(found: Assessment) -> list[MotionCurve]:
-    """Every error motion except squareness as a function over its stroke, with its standard uncertainty, µm or µrad."""
+    """Every error motion of a solution except squareness."""
     joint = found.joint
-    stroke = joint.machine.stroke_mm
-    nodes = np.stack([np.linspace(lo, hi, CURVE_NODES) for lo, hi in stroke], axis=1)
-    values = term_values(joint.terms, nodes, stroke)
     status = {m.name: m.status for m in found.observability.motions}
+    return curves_of(joint.terms, joint.coefficients, joint.term_covariance, joint.machine.stroke_mm, status)
+
+
+def curves_of(terms: tuple[Term, ...], coefficients: F1, covariance: F2, stroke_mm: F2, status: Mapping[str, str]) -> list[MotionCurve]:
+    """Every error motion except squareness as a function over its stroke, with its standard uncertainty, µm or µrad."""
+    nodes = np.stack([np.linspace(lo, hi, CURVE_NODES) for lo, hi in stroke_mm], axis=1)
+    values = term_values(terms, nodes, stroke_mm)
     out = []
-    for name in dict.fromkeys(t.motion for t in joint.terms if t.order):
-        at = [i for i, t in enumerate(joint.terms) if t.motion == name]
-        axis, turns = joint.terms[at[0]].axis, joint.terms[at[0]].component >= 3
+    for name in dict.fromkeys(t.motion for t in terms if t.order):
+        at = [i for i, t in enumerate(terms) if t.motion == name]
+        axis, turns = terms[at[0]].axis, terms[at[0]].component >= 3
         scale, unit = (1e6, "µrad") if turns else (1e3, "µm")
         basis = values[:, at]
-        variance = np.einsum("ni,ij,nj->n", basis, joint.term_covariance[np.ix_(at, at)], basis)
-        u = np.sqrt(np.maximum(variance, 0.0))
-        out.append(MotionCurve(name, AXES[axis], nodes[:, axis], basis @ joint.coefficients[at] * scale, u * scale, unit, status[name]))
+        u = np.sqrt(np.maximum(np.einsum("ni,ij,nj->n", basis, covariance[np.ix_(at, at)], basis), 0.0))
+        curve = MotionCurve(name, AXES[axis], nodes[:, axis], basis @ coefficients[at] * scale, u * scale, unit, status.get(name, ""))
+        out.append(curve)
     return out
 
 

@@ -36,7 +36,7 @@ SCREENS: tuple[Screen, ...] = (
     ("/alarms", "nav.alarms", Permission.READ, ("/alarms", "/alarm")),
     ("/live", "nav.live", Permission.READ, ("/live", "/new")),
     ("/runs", "nav.runs", Permission.READ, ("/runs", "/run", "/compare")),
-    ("/results", "nav.results", Permission.READ, ("/results", "/result", "/volume", "/whatif", "/budget")),
+    ("/results", "nav.results", Permission.READ, ("/results", "/result", "/motions", "/volume", "/whatif", "/budget")),
     ("/proposals", "nav.proposals", Permission.READ, ("/proposals", "/proposal", "/table")),
     ("/trends", "nav.trends", Permission.READ, ("/trends",)),
 )

@@ -359,7 +359,6 @@ def test_a_trend_is_zoomed_read_and_taken_along(chromium, running, axe) -> None:
         assert box.locator("canvas").count() == 2
         box.focus()
         page.keyboard.press("ArrowLeft")
-        page.keyboard.press("ArrowLeft")
         last = running.store.verifications.latest(limit=2)[-1]
         told = box.locator("output").inner_text()
         value, u = last.doc["values"]["body_diagonal_um"], last.doc["uncertainties"]["body_diagonal_um"]

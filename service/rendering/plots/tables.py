@@ -21,8 +21,11 @@ UM = 1e3
 OLD, NEW = "s-c1 dash", "s-c2"
 
 
-def motion_bands(curves: Sequence[MotionCurve], *, key: str) -> str:
-    """Error motions of one unit over their strokes, each with a band of U (k = 2); those not observable by themselves are dashed."""
+def motion_bands(curves: Sequence[MotionCurve], *, key: str, link: str = "") -> str:
+    """Error motions of one unit over their strokes, each with a band of U (k = 2); those not observable by themselves are dashed.
+
+    ``link``: address of the screen of a motion, which its name completes; empty: the panels lead nowhere.
+    """
     unit = curves[0].unit if curves else ""
     ends = [v for c in curves for v in (float((c.value - COVERAGE * c.u).min()), float((c.value + COVERAGE * c.u).max()))]
     names = sorted({c.name[1] for c in curves}), sorted({c.axis for c in curves})
@@ -35,6 +38,8 @@ def motion_bands(curves: Sequence[MotionCurve], *, key: str) -> str:
         panel.draw_line(svg, c.position_mm, c.value, "s-c1 dash" if c.status == NOT_OBSERVABLE else "s-c2")
         grid.draw_axes(svg, panel, cell, (f"{c.axis} in mm", f"E{c.name[1]} in {unit}"))
         _finish(svg, panel, c.name + ("" if c.status != NOT_OBSERVABLE else ", not by itself"))
+        if link:
+            svg.link((panel.left, panel.top), (panel.width, panel.height), link + c.name)
     grid.draw_columns(svg, 18.0)
     return svg.render()
 

@@ -13,6 +13,7 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen
 from abbe.service.web.pages.context import Number, PageContext, find_or_none
+from abbe.service.web.pages.motions import motions_screen
 from abbe.service.web.pages.results import solution_lines
 from abbe.service.web.pages.runs import compare_screen
 from abbe.service.web.pages.volume import NODES, VolumeQuery, volume_screen
@@ -26,6 +27,7 @@ Plane = Literal["XY", "XZ", "YZ"]
 
 def add_result_pages(app: FastAPI, context: PageContext) -> None:
     """Add the screens of volume map, what-if, budget and comparison of runs to the application."""
+    _add_motions(app, context)
     _add_volume(app, context)
     _add_whatif(app, context)
     _add_budget(app, context)
@@ -41,6 +43,17 @@ async def _solution(context: PageContext, number: int | None) -> SolutionRecord 
         number = newest[0].id
     record = await context.read(find_or_none, context.store.solutions.get, number)
     return record if record is not None else await context.missing("solution", number)
+
+
+def _add_motions(app: FastAPI, context: PageContext) -> None:
+    @app.get("/motions", include_in_schema=False)
+    @needs(Permission.READ)
+    async def motions(id: Number = None, motion: Annotated[str, Query(max_length=12)] = "") -> HTMLResponse:
+        record = await _solution(context, id)
+        if isinstance(record, HTMLResponse):
+            return record
+        screen = None if record is None else await context.read(motions_screen, context.store, record, motion)
+        return await context.show("motions.html", screen=screen, words={"plot.value": current().translate("plot.value")})
 
 
 def _add_volume(app: FastAPI, context: PageContext) -> None:

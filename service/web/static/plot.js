@@ -109,9 +109,10 @@ export class Plot {
   }
 }
 
-export function axes(values, paintNow, yLabel) {
+export function axes(values, paintNow, yLabel, xLabel) {
   const common = { stroke: paintNow.quiet, grid: { stroke: paintNow.line, width: 1 }, ticks: { stroke: paintNow.line, width: 1 }, font: "12px system-ui, sans-serif" };
-  return [{ ...common, ...(values ? { values } : {}) }, { ...common, label: yLabel, labelFont: "12px system-ui, sans-serif", labelSize: 18, size: 52 }];
+  const labelled = (label) => ({ ...common, label, labelFont: common.font, labelSize: 18 });
+  return [{ ...(xLabel ? labelled(xLabel) : common), ...(values ? { values } : {}) }, { ...labelled(yLabel), size: 52 }];
 }
 
 function save(blob, name) {
@@ -144,20 +145,101 @@ export function saveCsv(name, rows) {
   save(new Blob([rows.map((row) => row.map((one) => cell(String(one ?? ""))).join(",")).join("\n") + "\n"], { type: "text/csv" }), `${name}.csv`);
 }
 
+// ---- a box with a plot: value under the cursor, buttons, keys ---------------------------------------------------------------------
+
+// A subclass has `build`, `say(k)` (text of a point) and `rows` (of the CSV); its data have `key`, `x`, `y`. The plot's first and last
+// position (`ends`) may lie beside the data: `off` counts them.
+class Box {
+  constructor(box, told, words) {
+    this.box = box;
+    this.told = told;
+    this.words = words;
+    this.out = box.querySelector("output");
+  }
+
+  begin() {
+    this.build();
+    this.box.querySelector(".tools").hidden = false;
+    this.box.addEventListener("click", (event) => this.press(event.target.closest("button")?.dataset.do));
+    this.box.addEventListener("keydown", (event) => this.key(event));
+    this.tell(this.told.x.length - 1);
+  }
+
+  tell(k) {
+    if (k === null || k === this.at) return;
+    this.at = Math.min(Math.max(k, 0), this.told.x.length - 1);
+    this.say(this.at);
+  }
+
+  key(event) {
+    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
+    const act = { "+": "in", "-": "out", 0: "whole" }[event.key];
+    if (event.target.closest("button, a") || event.ctrlKey || event.metaKey || event.altKey || !(step || act)) return;
+    event.preventDefault();
+    if (act) return this.press(act);
+    const { x, y } = this.told;
+    const next = Math.min(Math.max(this.at + step, 0), x.length - 1);
+    const { plot } = this.main;
+    plot.setCursor({ left: plot.valToPos(x[next], "x"), top: plot.valToPos(y[next], "y") });
+    this.tell(next);
+  }
+
+  press(what) {
+    const { main, told } = this;
+    if (what === "in") main.zoom(0.5, Math.min(Math.max((told.x[this.at] - main.range[0]) / (main.range[1] - main.range[0]), 0), 1));
+    if (what === "out") main.zoom(2);
+    if (what === "left") main.move(-0.5);
+    if (what === "right") main.move(0.5);
+    if (what === "whole") main.show(...main.whole);
+    if (what === "png") savePng(told.key, [...this.box.querySelectorAll("[data-part]")]);
+    if (what === "csv") saveCsv(told.key, this.rows());
+  }
+}
+
+// ---- a curve with its band of U -------------------------------------------------------------------------------------------------
+
+class Curve extends Box {
+  constructor(box) {
+    super(box, JSON.parse(box.dataset.curve), JSON.parse(box.dataset.words));
+    this.begin();
+  }
+
+  build() {
+    const { told } = this;
+    const colours = paint();
+    const host = this.box.querySelector("[data-part=main]");
+    host.replaceChildren();
+    const [low, high] = [-1, 1].map((sign) => told.y.map((y, k) => y + sign * told.u[k]));
+    const most = Math.max(...high.map(Math.abs), ...low.map(Math.abs)) * 1.06 || 1;
+    const edge = { stroke: "transparent", points: { show: false } };
+    this.main = new Plot(host, {
+      scales: { x: { time: false, range: (_, min, max) => [min, max] }, y: { range: [Math.min(0, ...low) * 1.06 || -0.05 * most, Math.max(0, ...high) * 1.06 || 0.05 * most] } },
+      padding: [12, 12, 0, 0],
+      axes: axes(null, colours, `${told.name} [${told.unit}]`, told.x_name),
+      series: [{}, { stroke: colours.accent, width: 2, dash: told.dashed ? [6, 4] : [], points: { show: false } }, edge, edge],
+      bands: [{ series: [3, 2], fill: `${colours.accent}33` }],
+    }, [told.x, told.y, low, high], 300, (at) => this.tell(at));
+  }
+
+  say(k) {
+    const { told } = this;
+    this.out.textContent = fill(this.words["plot.value"], { at: told.x_name.replace(" [", ` = ${number(told.x[k])} `).replace("]", ""), value: told.shown[k][0], u: told.shown[k][1], unit: told.unit });
+  }
+
+  rows() {
+    const { told } = this;
+    return [[told.x_name, `${told.key} [${told.unit}]`, `U (k=2) [${told.unit}]`], ...told.x.map((x, k) => [x, told.y[k], told.u[k]])];
+  }
+}
+
 // ---- the trend of a figure ------------------------------------------------------------------------------------------------------
 
-class Trend {
+class Trend extends Box {
   constructor(box, words) {
-    this.box = box;
-    this.words = words;
-    this.told = JSON.parse(box.dataset.plot);
+    super(box, JSON.parse(box.dataset.plot), words);
     this.told.index = new Map(this.told.chart.x.map((at, k) => [at, k]));
-    this.out = box.querySelector("output");
-    this.build();
     box.querySelector("svg").remove();
-    box.querySelector(".tools").hidden = false;
-    box.addEventListener("click", (event) => this.press(event.target.closest("button")?.dataset.do));
-    box.addEventListener("keydown", (event) => this.key(event));
+    this.begin();
   }
 
   build() {
@@ -188,7 +270,7 @@ class Trend {
       axes: axes(days, colours, `${told.name} [${told.unit}]`),
       series: [{}, { show: true, stroke: "transparent", points: { show: false } }, { stroke: colours.fail, dash: [6, 4], points: { show: false }, spanGaps: true }],
       hooks: { drawAxes: [(u) => this.behind(u, colours)], draw: [(u) => this.points(u, colours)], setScale: [(u, key) => key === "x" && this.follow(u)] },
-    }, [[ends[0], ...told.x, ends[1]], padded(told.y), [limits[0] ?? null, ...told.limit, limits.at(-1) ?? null]], 300, (at) => this.tell(at));
+    }, [[ends[0], ...told.x, ends[1]], padded(told.y), [limits[0] ?? null, ...told.limit, limits.at(-1) ?? null]], 300, (at) => this.tell(at === null ? null : at - 1));
     const of = (list, by) => told.x.map((at) => (told.index.has(at) ? list[told.index.get(at)] / by(told.index.get(at)) : null));
     const { chart } = told;
     const ewma = of(chart.ewma.map((one) => one ?? NaN), (k) => chart.ewma_limit[k]).map((one) => (Number.isFinite(one) ? one : null));
@@ -201,7 +283,7 @@ class Trend {
       hooks: { draw: [(u) => inside(u, (pen, x, y, b) => {
         for (const one of [1, -1]) line(pen, [[b.left, y(one)], [b.left + b.width, y(one)]], colours.fail, { dash: [6, 4] });
       })] },
-    }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(ewma)], 150, (at) => this.tell(at));
+    }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(ewma)], 150, (at) => this.tell(at === null ? null : at - 1));
     this.main.show(...ends);
   }
 
@@ -265,47 +347,20 @@ class Trend {
     return stamp(uPlot.tzDate(new Date(at * 1e3), this.told.zone));
   }
 
-  tell(index) {
+  say(k) {
     const { told, words } = this;
-    const k = index === null ? -1 : Math.min(Math.max(index - 1, 0), told.x.length - 1);
-    if (k < 0 || k === this.at) return;
-    this.at = k;
     const c = told.index.get(told.x[k]);
-    const told1 = fill(words["plot.at"], {
+    const value = fill(words["plot.at"], {
       when: this.when(told.x[k]), value: told.shown[k][0], u: told.shown[k][1], unit: told.unit,
       verdict: words[`verdict.${VERDICTS[told.verdict[k]]}`], check: told.check[k],
     });
     const chart = c === undefined ? "" : ` · CUSUM ↑ ${told.chart.high[c].toFixed(1)} ↓ ${told.chart.low[c].toFixed(1)} (${told.chart.h}) · EWMA ${told.chart.ewma[c] === null ? "–" : told.chart.ewma[c].toFixed(2)}`;
     const marks = told.marks.filter((mark) => Math.abs(mark.at - told.x[k]) < 43200).map((mark) => ` · ${mark.sign} ${mark.text}`);
-    this.out.textContent = told1 + chart + marks.join("");
+    this.out.textContent = value + chart + marks.join("");
     const link = this.box.querySelector("a.open");
     link.hidden = false;
     link.href = `/check?id=${told.check[k]}`;
     link.textContent = fill(words["check.open"], { n: told.check[k] });
-  }
-
-  key(event) {
-    const step = { ArrowLeft: -1, ArrowRight: 1 }[event.key];
-    const act = { "+": "in", "-": "out", 0: "whole" }[event.key];
-    if (event.target.closest("button, a") || event.ctrlKey || event.metaKey || event.altKey || !(step || act)) return;
-    event.preventDefault();
-    if (act) return this.press(act);
-    const { x } = this.told;
-    const next = Math.min(Math.max((this.at ?? x.length) + step, 0), x.length - 1);
-    const { plot } = this.main;
-    plot.setCursor({ left: plot.valToPos(x[next], "x"), top: plot.valToPos(this.told.y[next], "y") });
-    this.tell(next + 1);
-  }
-
-  press(what) {
-    const { main, told } = this;
-    if (what === "in") main.zoom(0.5, this.at === undefined ? 1 : (told.x[this.at] - main.range[0]) / (main.range[1] - main.range[0]));
-    if (what === "out") main.zoom(2);
-    if (what === "left") main.move(-0.5);
-    if (what === "right") main.move(0.5);
-    if (what === "whole") main.show(...main.whole);
-    if (what === "png") savePng(told.key, [...this.box.querySelectorAll("[data-part]")]);
-    if (what === "csv") saveCsv(told.key, this.rows());
   }
 
   rows() {
@@ -325,10 +380,12 @@ function stamp(date) {
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} ${two(date.getHours())}:${two(date.getMinutes())}`;
 }
 
-const list = document.getElementById("trend-plots");
-if (list && uPlot) {
-  const words = JSON.parse(list.dataset.words);
-  const all = [...list.querySelectorAll("[data-plot]")].map((box) => new Trend(box, words));
-  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => all.forEach((one) => one.build()));
+const boxes = [];
+if (uPlot) {
+  const list = document.getElementById("trend-plots");
+  const words = list ? JSON.parse(list.dataset.words) : {};
+  boxes.push(...[...document.querySelectorAll("[data-plot]")].map((box) => new Trend(box, words)));
+  boxes.push(...[...document.querySelectorAll("[data-curve]")].map((box) => new Curve(box)));
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => boxes.forEach((one) => one.build()));
   document.documentElement.dataset.plotted = "yes";
 }
