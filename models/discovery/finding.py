@@ -13,7 +13,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.agreement import agreements
 from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffect, NextTest, Verdict
 from abbe.models.discovery.candidate_bank import Pick
-from abbe.models.discovery.experiment.additions import blind_spots
+from abbe.models.discovery.experiment.additions import blind_spots, judging_run
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
@@ -423,7 +423,7 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
 
 
 def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
-    """Propose the measurement that best separates the strongest named effect with rivals from these."""
+    """Propose the measurement that best separates the strongest named effect with rivals from these; without rivals, a run that judges."""
     for i in kept:
         if not rivals[i]:
             continue
@@ -434,7 +434,7 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
         test = propose(problem.case, leader, others, {k: c.sd_mm for k, c in problem.colours.items()})
         if test is not None:
             return test
-    return None
+    return judging_run(problem.case) if kept else None
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 
@@ -62,6 +63,7 @@ class PlanStep:
     label, setup_id : str
         Name of the run; name of its set-up, which consecutive steps can share.
     test : HelixTest, DiagonalTest or LineTest
+    role : "identify", or "holdout" for the run that only judges and lowers no uncertainty.
     minutes, until_min : float
         Set-up and machine time of this step; of the plan up to the end of this step.
     u_worst_mm, u_mean_mm : float
@@ -76,6 +78,7 @@ class PlanStep:
     until_min: float
     u_worst_mm: float
     u_mean_mm: float
+    role: Literal["identify", "holdout"] = "identify"
 
 
 @dataclass(frozen=True)
@@ -87,7 +90,7 @@ class MeasuringPlan:
     machine : Machine
     tools : Instruments
     steps : tuple of PlanStep
-        In the order of measuring: the set-up that gains most per minute comes first.
+        In the order of measuring: the set-up that gains most per minute comes first. One of them only judges (`judge`).
     runs : tuple of RunData
         The runs of a perfect machine: positions, directions, times and weights of the block means, deviations zero.
     u_before_mm : tuple of two floats
@@ -116,6 +119,11 @@ class MeasuringPlan:
     def recipes(self) -> tuple[Measurement, ...]:
         """The measurements alone, in order."""
         return tuple(s.test for s in self.steps)
+
+    @property
+    def judge(self) -> PlanStep | None:
+        """The run that is not fitted and only judges; None: the minutes are too few for one."""
+        return next((s for s in self.steps if s.role == "holdout"), None)
 
     @property
     def minutes(self) -> float:
@@ -162,14 +170,14 @@ def plan_campaign(
     search = PlanSearch(what, candidates(machine, what.tools, vertical), INNER_SHARE, progress)
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     if goal_mm is None:
-        chosen, reached = search.exchange(search.best_fill(minutes), minutes, PASSES), False
+        chosen, reached = search.with_room(search.exchange(search.best_fill(minutes), minutes, PASSES), minutes), False
     else:
         chosen, reached = shortest(search, rows, goal_mm, minutes, PASSES)
     if not chosen:
         raise ValueError(f"planner: no measurement fits into {minutes:g} minutes")
     warning = opening(machine, vertical).warning
     helices = any(isinstance(t, HelixTest) for tests in chosen.values() for t in tests)
-    plan = replace(laid_out(search, chosen, goal_mm if reached else None), warnings=(warning,) if warning and helices else ())
+    plan = replace(laid_out(search, chosen, minutes, goal_mm if reached else None), warnings=(warning,) if warning and helices else ())
     if goal_mm is None:
         return plan
     floor_mm, limit_by = limit(search, rows)
@@ -180,20 +188,24 @@ def plan_campaign(
     return replace(plan, goal=Goal(goal_mm, reached, needed, floor_mm, limit_by))
 
 
-def laid_out(search: PlanSearch, chosen: Chosen, goal_mm: float | None = None) -> MeasuringPlan:
-    """Turn a choice of measurements into a plan: order them by gain per minute, label them, stop where the goal (U, mm) is reached."""
+def laid_out(search: PlanSearch, chosen: Chosen, budget_min: float, goal_mm: float | None = None) -> MeasuringPlan:
+    """Turn a choice of measurements into a plan: order them by gain per minute, label them, stop where the goal (U, mm) is reached.
+
+    A run that only judges joins one of the mountings if the minutes allow it.
+    """
     machine, tools = search.what.machine, search.what.tools
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)
     stated = scale_temperature_mm2(search.what, rows)
     steps = _steps(search, chosen)
     enough = [k for k, s in enumerate(steps, start=1) if goal_mm is not None and COVERAGE * s.u_worst_mm <= goal_mm]
-    steps = steps[: enough[0]] if enough else steps
+    steps = _judged(search, steps[: enough[0]] if enough else steps, budget_min)
     runs = tuple(
         replace(expected_run(machine, s.test, tools, start_s=(s.until_min - s.minutes) * 60.0), label=s.label, setup=s.setup_id)
         for s in steps
     )
+    fitted = tuple(run for run, s in zip(runs, steps, strict=True) if s.role == "identify")
     before = uncertainty_mm(np.eye(search.what.size), rows, stated)
-    return MeasuringPlan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, runs))
+    return MeasuringPlan(machine, tools, steps, runs, before, float(np.sqrt(stated.max())), not_observable(search.what, fitted))
 
 
 def _steps(search: PlanSearch, chosen: Chosen) -> tuple[PlanStep, ...]:
@@ -211,6 +223,20 @@ def _steps(search: PlanSearch, chosen: Chosen) -> tuple[PlanStep, ...]:
             steps.append(PlanStep(_label(test, number, k), f"S{number}", test, minutes, until, worst, mean))
         total += search.mounting(tests)
     return tuple(steps)
+
+
+def _judged(search: PlanSearch, steps: tuple[PlanStep, ...], budget_min: float) -> tuple[PlanStep, ...]:
+    """Insert the judge after the last test of its mounting, if it fits into the minutes; later steps end later."""
+    chosen: Chosen = {}
+    for s in steps:
+        chosen[s.test.mounting] = (*chosen.get(s.test.mounting, ()), s.test)
+    test = search.judge(chosen, budget_min)
+    if test is None:
+        return steps
+    at = max(k for k, s in enumerate(steps, start=1) if s.test.mounting == test.mounting)
+    last, minutes = steps[at - 1], search.cost_min(test, chosen[test.mounting])
+    judge = replace(last, label=f"judge-{last.label}", test=test, minutes=minutes, until_min=last.until_min + minutes, role="holdout")
+    return (*steps[:at], judge, *(replace(s, until_min=s.until_min + minutes) for s in steps[at:]))
 
 
 def _in_order(search: PlanSearch, chosen: Chosen) -> list[str]:

@@ -15,7 +15,16 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.planning.measurements import HelixTest, LineTest, Measurement, SetupMinutes, bars_that_fit, machine_seconds
+from abbe.models.planning.measurements import (
+    ORDERS,
+    DiagonalTest,
+    HelixTest,
+    LineTest,
+    Measurement,
+    SetupMinutes,
+    bars_that_fit,
+    machine_seconds,
+)
 from abbe.models.planning.problem import (
     BAR_SCALE,
     LASER_SCALE,
@@ -39,6 +48,10 @@ Chosen = dict[str, tuple[Measurement, ...]]
 """Tests of each mounting (`HelixTest.mounting`), in the order in which they were chosen."""
 COVERAGE = 2.0
 """Coverage factor: U = 2 u."""
+JUDGE_SHARE = 0.05
+"""Largest share of the minutes that the run which only judges may take: it lowers no uncertainty."""
+JUDGE_LOSS = 0.1
+"""Largest relative increase of the plan's uncertainty for the sake of that run."""
 LONGEST_MIN = 480.0
 """Longest plan considered, one day's work; for a goal that needs more, only the limit is reported (`Goal`)."""
 _FOREVER = 1e6
@@ -202,6 +215,43 @@ class PlanSearch:
             if not improved:
                 break
         return chosen
+
+    def judge(self, chosen: Chosen, budget_min: float) -> Measurement | None:
+        """The run to judge a plan, never fitted: at a mounting of the plan, so that only the machine can make it deviate.
+
+        The longest bar the other way round, else another step order of a diagonal; None: none fits into what the plan leaves of the
+        minutes, and into `JUDGE_SHARE` of them.
+        """
+        most = min(budget_min - self.total_min(chosen), JUDGE_SHARE * budget_min)
+        found = [t for tests in chosen.values() for t in _unused(tests) if self.cost_min(t, tests) <= most]
+        return max(found, key=_reach_mm, default=None)
+
+    def with_room(self, chosen: Chosen, budget_min: float) -> Chosen:
+        """Make room in a full plan for its judge (`judge`): the longest that costs at most `JUDGE_LOSS`; else the plan as it is."""
+        most = self.criterion(chosen) + JUDGE_LOSS
+        tried = {-1.0: chosen}
+        for smaller in (chosen, *_without_one(chosen)):
+            judge = self.judge(smaller, budget_min)
+            if judge is not None:
+                trial = self.fill(smaller, budget_min - self.cost_min(judge, smaller[judge.mounting]))
+                kept = self.judge(trial, budget_min)
+                if kept is not None and self.criterion(trial) < min(most, self.criterion(tried.get(_reach_mm(kept), {}))):
+                    tried[_reach_mm(kept)] = trial
+        return tried[max(tried)]
+
+
+def _reach_mm(test: Measurement) -> float:
+    return test.radius_mm if isinstance(test, HelixTest) else 0.0
+
+
+def _unused(tests: tuple[Measurement, ...]) -> list[Measurement]:
+    """Measurements that the mounting of ``tests`` allows without a person and that are not among them."""
+    last = tests[-1]
+    if isinstance(last, HelixTest):
+        again: list[Measurement] = [replace(last, direction=-last.direction)]
+    else:
+        again = [replace(last, order=order) for order in ORDERS] if isinstance(last, DiagonalTest) else []
+    return [t for t in again if t not in tests]
 
 
 def _follows(test: HelixTest, before: tuple[Measurement, ...]) -> bool:

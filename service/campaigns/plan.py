@@ -168,7 +168,8 @@ def plan_for(
     campaign = paced(CampaignPlan(name, tuple(r.plan(site.machine) for r in recipes)), site.max_feed_mm_min)
     dry = dry_run_campaign(site.machine, campaign, site.max_feed_mm_min)
     note = f"for {site.name}, {plan.minutes:.0f} minutes with set-ups; expected worst U {_um(COVERAGE * plan.u_worst_mm)} um"
-    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), (*notes, *plan.warnings))
+    notes = (*notes, *plan.warnings, judge_note(plan))
+    return PlannedCampaign(plan, recipes, campaign, dry, recipe_text(name, recipes, note), notes)
 
 
 def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
@@ -179,7 +180,7 @@ def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
         return Helix(
             step.label,
             step.setup_id,
-            "identify",
+            step.role,
             test.centre_mm,
             test.radius_mm,
             turns=test.turns,
@@ -190,8 +191,8 @@ def recipe_of(step: PlanStep, tools: Instruments) -> Recipe:
             u_length_mm=tools.u_bar_length_mm,
         )
     if isinstance(test, DiagonalTest):
-        return Diagonal(step.label, step.setup_id, "identify", test.diagonal, test.steps, test.order, feed_mm_min=feed)
-    return Linear(step.label, step.setup_id, "identify", test.axis, at_share=test.at, positions=test.n, feed_mm_min=feed)
+        return Diagonal(step.label, step.setup_id, step.role, test.diagonal, test.steps, test.order, feed_mm_min=feed)
+    return Linear(step.label, step.setup_id, step.role, test.axis, at_share=test.at, positions=test.n, feed_mm_min=feed)
 
 
 def describe(test: Measurement) -> str:
@@ -214,6 +215,13 @@ def temperature_note(plan: MeasuringPlan) -> str:
         f"in every U: scales known to {inputs.u_scale_temperature_k:g} K ({inputs.scale_expansion_per_k * 1e6:g} µm/m/K), "
         f"which alone make U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
     )
+
+
+def judge_note(plan: MeasuringPlan) -> str:
+    """Describe the run that only judges, and its price."""
+    if plan.judge is None:
+        return "no run only judges: the minutes are too few for one, so `abbe discover` can prove no name"
+    return f"{plan.judge.label} is not fitted: it judges what is found, for {plan.judge.minutes:.1f} minutes"
 
 
 def goal_lines(plan: MeasuringPlan) -> list[str]:
@@ -288,6 +296,7 @@ def plan_doc(planned: PlannedCampaign) -> dict[str, Any]:
         {
             "label": s.label,
             "setup": s.setup_id,
+            "role": s.role,
             "what": describe(s.test),
             "minutes": s.minutes,
             "until_min": s.until_min,

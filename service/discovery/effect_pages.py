@@ -21,6 +21,7 @@ ADDS = {
     "second_tool_length": "the same runs with a second tool length",
     "longer_session": "a repeat late in the session",
     "reference_length": "a calibrated reference length",
+    "judging_run": "a run of the role holdout: it is not fitted and only judges",
 }
 
 HEADINGS = ("name", "what it is", "sits at", "usual size", "taken out by")

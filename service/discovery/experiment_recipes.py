@@ -211,6 +211,7 @@ MAKERS: dict[str, Maker] = {
     "longer_session": lambda like, name: _named(like, name, "late"),
     "laser_diagonals": _diagonals,
     "single_axis_laser": _lines,
+    "judging_run": lambda like, name: _named(like, name, "judge", direction=-1 if like.direction > 0 else 1, role="holdout"),
 }
 """Additions that the sequencer can run. Circles in the planes, other tools, angular optics and reference lengths need a person."""
 LASER = ("laser_diagonals", "single_axis_laser")

@@ -21,6 +21,7 @@ Adds = Literal[
     "second_tool_length",
     "longer_session",
     "reference_length",
+    "judging_run",
 ]
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.answer import BlindSpot
+from abbe.models.discovery.answer import BlindSpot, NextTest
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.effects.path import Path, Places, at_rest, driven
 from abbe.models.machine import AXES, Machine
@@ -90,6 +90,15 @@ def offers(case: Case) -> tuple[ExperimentOffer, ...]:
     if bars and not any(r.length_calibrated for r in case.of("identify")):
         out.append(ExperimentOffer("reference_length", (), LENGTH_MIN, "the bar's length against a standard", knows_length=True))
     return tuple(out)
+
+
+def judging_run(case: Case) -> NextTest | None:
+    """Return the run that a campaign with ball-bar runs needs to prove a name: not fitted, the other way round; None if it has a judge."""
+    bars = [r.path for r in case.of("identify") if r.path.kind == "bar"]
+    if case.of("holdout") or not bars:
+        return None
+    minutes = BAR_MIN + RUN_MIN + float(np.ptp(bars[0].at.t_s)) / 60.0
+    return NextTest(("judging_run",), (), None, minutes, "no run of this campaign judges: the path of its first helix, the other way round")
 
 
 def one_feed(bars: list[Path]) -> bool:

@@ -37,18 +37,31 @@ def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) 
 
 
 def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identify") -> CampaignPlan:
-    """Return five helices, six lines, eight step diagonals: about 22 minutes of machine time for a 600 x 500 x 450 mm machine."""
+    """Return five helices, six lines, eight step diagonals: about 25 minutes of machine time for a 600 x 500 x 450 mm machine.
+
+    Two more runs have the role holdout, for 3 of these minutes: the first helix the other way round, and a third step order of the last
+    diagonal. They share a mounting with fitted runs, so that only the model can cause their deviation.
+    """
     recipes: list[Recipe] = []
     places = [(0.5, 0.5, 0.3), (0.32, 0.36, 0.2), (0.68, 0.64, 0.2), (0.32, 0.64, 0.25), (0.68, 0.36, 0.25)]
     for k, rel in enumerate(places):
         centre, radius = hemisphere(machine, rel, 0.85 if k == 0 else 0.95)
-        recipes.append(Helix(f"helix{k + 1}", f"B{k + 1}", "identify", centre, radius, rate_hz=rate_hz))
+        helix = Helix(f"helix{k + 1}", f"B{k + 1}", "identify", centre, radius, rate_hz=rate_hz)
+        recipes += _with_judge(helix, replace(helix, direction=-1)) if k == 0 else [helix]
     for a in range(3):
         for k, at in enumerate((0.15, 0.85)):
             recipes.append(Linear(f"line{AXES[a]}{k + 1}", f"L{AXES[a]}{k + 1}", "identify", a, at_share=(at, at)))
     for order in ("XYZ", "ZYX"):
         recipes += [Diagonal(f"step-{d}-{order}", f"D{d}{order}", "identify", d, 12, order) for d in DIAGONALS]
+    last = recipes.pop()
+    assert isinstance(last, Diagonal)
+    recipes += _with_judge(last, replace(last, order="YXZ"))
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
+
+
+def _with_judge(fitted: Helix | Diagonal, judge: Helix | Diagonal) -> list[Recipe]:
+    """Return a test and, in the same mounting, the one that only judges."""
+    return [replace(fitted, unmount=False), replace(judge, label=f"judge-{fitted.label}", role="holdout", mount=False)]
 
 
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:

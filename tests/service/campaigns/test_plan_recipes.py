@@ -180,7 +180,7 @@ def test_only_what_the_machine_file_names_is_planned(named, kinds, says):
     found = plan_for(replace(site(), urls=DeviceUrls(**{named: "x"})), minutes=7.0, tools=ONE_BAR)
     assert {type(r) for r in found.recipes} <= kinds
     assert says in found.notes[0]
-    assert len(found.notes) == 1 + (named == "ballbar")  # helices of a machine without tool_mm: where is the spindle?
+    assert len(found.notes) == 2 + (named == "ballbar")  # of the judge; helices of a machine without tool_mm: where is the spindle?
     assert says in document_html(plan_report(site(), found))
 
 

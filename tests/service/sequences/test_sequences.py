@@ -2,7 +2,7 @@
 
 import math
 import os
-from itertools import pairwise
+from itertools import groupby, pairwise
 
 import numpy as np
 import pytest
@@ -13,7 +13,18 @@ from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run, dry_run_campaign, positions
 from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear
-from abbe.service.sequences.steps import MAX_PATH_POINTS, MountBar, MountLaser, MoveTo, ReadLaser, RecordPath, TestPlan, Unmount, ZeroLaser
+from abbe.service.sequences.steps import (
+    MAX_PATH_POINTS,
+    CampaignPlan,
+    MountBar,
+    MountLaser,
+    MoveTo,
+    ReadLaser,
+    RecordPath,
+    TestPlan,
+    Unmount,
+    ZeroLaser,
+)
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
@@ -81,10 +92,19 @@ def test_an_approach_ends_at_the_stroke():
 
 def test_whatever_is_mounted_is_taken_away_before_the_next_test():
     for campaign in (identification(MACHINE), verification(MACHINE), quick_check(MACHINE)):
-        for test in campaign.tests:
-            assert sum(isinstance(s, MountBar | MountLaser) for s in test.steps) == 1
-            assert isinstance(test.steps[-1], Unmount)
-            assert sum(isinstance(s, Unmount) for s in test.steps) == 1
+        for _, tests in groupby(campaign.tests, key=lambda t: t.setup_id):
+            steps = [s for t in tests for s in t.steps]
+            assert sum(isinstance(s, MountBar | MountLaser) for s in steps) == 1
+            assert isinstance(steps[-1], Unmount)
+            assert sum(isinstance(s, Unmount) for s in steps) == 1
+
+
+def test_the_identification_holds_runs_that_only_judge_in_mountings_of_fitted_runs():
+    tests = identification(MACHINE).tests
+    judges = [t for t in tests if t.role == "holdout"]
+    assert [t.label for t in judges] == ["judge-helix1", "judge-step-ppn-ZYX"]
+    assert all(any(t.setup_id == j.setup_id and t.role == "identify" for t in tests) for j in judges)
+    assert sum(d.duration_s for d in dry_run_campaign(MACHINE, CampaignPlan("judges", tuple(judges)), 6000.0)) < 240.0
 
 
 def test_two_helices_in_one_set_up_mount_once_and_clear_away_once():
