@@ -1,4 +1,4 @@
-"""A report as HTML page, PDF, CSV, JSON, DCC or AQDEF. Page and PDF print the same text (`document_data.shown`) and the same pictures."""
+"""A report as HTML page, PDF, CSV, JSON, DCC, AQDEF or QIF. Page and PDF print the same text (`document_data.shown`) and pictures."""
 
 from __future__ import annotations
 
@@ -21,6 +21,7 @@ from abbe.service.rendering.document_data import document_csv, document_json, sh
 from abbe.service.rendering.numbers import printable
 from abbe.service.rendering.page_file import write_page
 from abbe.service.rendering.palette import paper_rules, style_rules
+from abbe.service.rendering.qif import document_qif
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 FONT = "Libertinus Serif"
@@ -68,6 +69,7 @@ FORMS: dict[str, Callable[[Document], str | bytes]] = {
     ".json": document_json,
     ".xml": document_dcc,
     ".dfq": document_dfq,
+    ".qif": document_qif,
 }
 """Writer of each file extension."""
 

@@ -1,4 +1,4 @@
-"""``abbe report``: a report for signature, as PDF, HTML, CSV or JSON, or as DCC or AQDEF for other programs."""
+"""``abbe report``: a report for signature, as PDF, HTML, CSV or JSON, or as DCC, AQDEF or QIF for other programs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from abbe.service.report.report_parts import Rules
 
 
-OUT_HELP = "FILE.pdf, .html, .csv, .json, .xml (DCC) or .dfq (AQDEF); may be repeated. Default: a PDF here."
+OUT_HELP = "FILE.pdf, .html, .csv, .json, .xml (DCC), .dfq (AQDEF) or .qif; may be repeated. Default: a PDF here."
 
 
 def report(  # noqa: PLR0913 - one argument for each option

@@ -1,7 +1,8 @@
-"""A report as DCC and as AQDEF: valid for other people's validators, and read back by other people's readers."""
+"""A report as DCC, AQDEF and QIF: valid for other people's validators, and read back by other people's readers."""
 
 from __future__ import annotations
 
+import os
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -21,9 +22,12 @@ from xmlschema.exceptions import XMLResourceParseError
 
 from abbe.service.domain.machine import Issuer
 from abbe.service.errors import FileFormatError
+from abbe.service.rendering import qif
 from abbe.service.rendering.aqdef import document_dfq
 from abbe.service.rendering.certificate import UNITS, document_dcc
 from abbe.service.rendering.document import Document, Instrument, ReportFigure
+from abbe.service.rendering.qif import document_qif
+from tests.conftest import Require
 
 NOT_CLOSED = pytest.mark.filterwarnings("ignore::pytest.PytestUnraisableExceptionWarning", "ignore::ResourceWarning")
 """aqdefreader leaves its file to the garbage collector."""
@@ -203,3 +207,41 @@ def test_the_other_reader_reads_other_peoples_files_too(shared: Path, capsys: py
     (part,) = read_dfq_file(str(samples[0])).get_parts()
     assert [one.get_data("K2001") for one in part.get_characteristics()] == [f"<characteristic_code_{k}>" for k in (1, 2, 3)]
     capsys.readouterr()
+
+
+QIF = f"{{{qif.NAMESPACE}}}"
+
+
+@pytest.mark.filterwarnings("ignore::xmlschema.XMLSchemaImportWarning")
+def test_qif_is_valid_by_the_schema_of_the_standard(require: Require) -> None:
+    """No package holds the schema: ABBE_QIF_SCHEMA names the folder with QIFDocument.xsd, e.g. of the QIF community."""
+    folder = Path(os.environ.get("ABBE_QIF_SCHEMA", "/nonexistent"))
+    require("qif", (folder / "QIFDocument.xsd").is_file(), "ABBE_QIF_SCHEMA names no folder with QIFDocument.xsd")
+    schema = XMLSchema10(folder / "QIFDocument.xsd", allow="local")  # it names a schema of signatures on another computer
+    for figures in (FIGURES, FIGURES[:1], FIGURES[3:]):
+        assert [error.reason for error in schema.iter_errors(document_qif(replace(DOCUMENT, figures=figures)))] == []
+    spoilt = document_qif(DOCUMENT).replace(">INDETERMINATE<", ">PERHAPS<")
+    assert len(list(schema.iter_errors(spoilt))) == 1
+
+
+def test_every_figure_is_in_qif_with_u_unit_limit_and_status() -> None:
+    root = etree.fromstring(document_qif(DOCUMENT).encode())
+    items = {one.get("id"): one for one in root.iter(f"{QIF}UserDefinedUnitCharacteristicItem")}
+    nominals = {one.get("id"): one for one in root.iter(f"{QIF}UserDefinedUnitCharacteristicNominal")}
+    found = list(root.iter(f"{QIF}UserDefinedUnitCharacteristicMeasurement"))
+    judged = [figure for figure in FIGURES if figure.limit is not None]
+    for figure, measured in zip(judged, found, strict=True):
+        item = items[measured.findtext(f"{QIF}CharacteristicItemId")]
+        limit = nominals[item.findtext(f"{QIF}CharacteristicNominalId")].find(f"{QIF}MaxValue")
+        value = measured.find(f"{QIF}Value")
+        assert (item.findtext(f"{QIF}Name"), value.get("unitName"), limit.get("unitName")) == (figure.symbol, "µm", "µm")
+        assert [float(one) for one in (value.text, value.get("combinedUncertainty"), limit.text)] == [figure.value, figure.u, figure.limit]
+    status = [one.findtext(f"{QIF}Status/{QIF}CharacteristicStatusEnum") for one in found]
+    assert status == ["PASS", "INDETERMINATE", "FAIL"]
+    others = {one.get("name"): one.get("value") for one in root.iter(f"{QIF}AttributeStr")}
+    assert others[f"{GROUP}: R"] == "not observable"
+    assert others["Ball-bar <XY> & \ufffd: AF_SQUARENESS"] == "-18.2 µm/m; U is not known"
+    numbers = [int(one.get("id")) for one in root.iter() if one.get("id")]
+    assert (len(set(numbers)), int(root.get("idMax"))) == (len(numbers), max(numbers))
+    with pytest.raises(FileFormatError, match="QIF holds figures"):
+        document_qif(replace(DOCUMENT, figures=[]))
