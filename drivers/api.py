@@ -163,10 +163,14 @@ class ProbeState:
 
 @dataclass(frozen=True, slots=True)
 class Latch:
-    """Commanded position at which the probe tripped, and when, microseconds of the controller's clock."""
+    """Axis position at which the probe tripped, and when, microseconds of the controller's clock.
+
+    ``period_s``: how often the control looks at the probe; the trip was up to so much earlier. 0: the probe latches by itself.
+    """
 
     position_mm: Point
     ctrl_us: int
+    period_s: float = 0.0
 
 
 class BankState(StrEnum):

@@ -12,6 +12,7 @@ from abbe.models.solvers.observations import RunData, bar_normals, nominal_readi
 from abbe.models.solvers.observe import LOST, predict, run_jacobian
 from abbe.models.solvers.priors import U_WAVELENGTH
 
+SAME_MM = 3.0
 U_REPEAT_MM = 1e-4
 """Repeatability of the helix figure after mounting the ball-bar again: assumed, not measured."""
 
@@ -64,11 +65,20 @@ def helix_figure(run: RunData) -> VerificationFigure:
     return VerificationFigure(rms, float(np.hypot(noise / np.sqrt(len(left)), U_REPEAT_MM)), np.arange(len(left), dtype=np.float64), left)
 
 
+def same_pose(a: RunData, b: RunData) -> bool:
+    """Whether the artefact lay alike in two runs, within `SAME_MM`: turned alike, its touched points about the same place."""
+    p, q = a.points, b.points
+    if p is None or q is None or q.source == "length" or p.artefact != q.artefact or not np.allclose(p.matrix, q.matrix, atol=1e-3):
+        return False
+    zero = [r.axes_mm[0] - one.matrix @ one.nominal_mm[0] for r, one in ((a, p), (b, q))]
+    return float(np.linalg.norm(zero[1] - zero[0])) < SAME_MM
+
+
 def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = False) -> VerificationFigure:
     """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
 
     ``with_machine``: what the solution of the machine leaves, too, in place of the whole deviation. Without a calibrated length the common
-    scale is fitted, too. The uncertainty combines that of the form with the noise of a reading.
+    scale is fitted, too. Noise and uncertainty of the form, which add to the squares, are taken out of the rms; its uncertainty is theirs.
     """
     p = run.points
     assert p is not None
@@ -88,8 +98,10 @@ def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = Fals
     y = run.deviation_mm - predict(known.machine, known.terms, run, known.setup, theta)
     left = without_pose(y[:, None])[:, 0]
     slope = without_pose(run_jacobian(known.machine, known.terms, run, known.setup, theta)[:, n_machine:])
-    along = left @ slope
-    noise = known.noise_mm["artefact"] ** 2 * float(left @ left)
-    rms = float(np.sqrt(np.mean(left**2)))
-    u = np.sqrt(float(along @ known.estimate.covariance[n_machine:, n_machine:] @ along) + noise) / (len(left) * rms)
-    return VerificationFigure(rms, float(u), np.arange(len(left), dtype=np.float64), left)
+    free_noise = np.eye(len(left)) - basis @ basis.T
+    covariance = slope @ known.estimate.covariance[n_machine:, n_machine:] @ slope.T
+    covariance += known.noise_mm["artefact"] ** 2 * (free_noise / run.weight_n) @ free_noise
+    square = max(float(np.mean(left**2) - np.trace(covariance) / len(left)), 0.0)
+    u_square = float(np.sqrt(4.0 * left @ covariance @ left + 2.0 * np.sum(covariance**2))) / len(left)
+    rms, u = np.sqrt(square), u_square / (np.sqrt(square) + np.sqrt(square + u_square))
+    return VerificationFigure(float(rms), float(u), np.arange(len(left), dtype=np.float64), left)

@@ -64,6 +64,8 @@ class Control:
         # Only now: whoever asks for HAL before the control has made it would make one himself.
         self._component = hal.component("abbe-bridge")
         self._component.ready()
+        period_ns = linuxcnc.ini(self._status.ini_filename).find("EMCMOT", "SERVO_PERIOD")
+        self.latch_period_us = round(float(period_ns) * 1e-3) if period_ns else 1000  # motion's own default
         axes = self._status.axis[:JOINTS]
         self.low_mm = tuple(float(a["min_position_limit"]) for a in axes)
         self.high_mm = tuple(float(a["max_position_limit"]) for a in axes)

@@ -115,6 +115,11 @@ class Motion:
         line = 0 if self.state.in_position else self.state.line
         return min(max(line - len(_HEADER) - 2, self._path_points), self._pending.points)
 
+    @property
+    def latch_period_us(self) -> int:
+        """How often the control looks at the probe."""
+        return self._control.latch_period_us
+
     def may_move(self) -> bool:
         """Whether the interlocks of motion hold."""
         s = self.state

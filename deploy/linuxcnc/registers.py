@@ -96,7 +96,7 @@ class RegisterMap:
             position_mm, at_us = self._motion.latch
             self._latch = (*(round(p / _UNIT_MM) for p in position_mm), at_us, self._touch)
             self._touch = None
-        return _words(">H3iQH4x", state.probe_ready | state.deflected << 1, *self._latch)
+        return _words(">H3iQHH2x", state.probe_ready | state.deflected << 1, *self._latch, self._motion.latch_period_us)
 
     def _bits(self) -> int:
         motion, state = self._motion, self._motion.state

@@ -60,6 +60,7 @@ STATUS = RegisterBlock(
         Register(55, "i32", "LATCH_Z", COUNTS_PER_MM, "mm"),
         Register(57, "u64", "LATCH_US", 1e6, "s"),
         Register(61, "u16", "LATCH_SEQ"),
+        Register(62, "u16", "LATCH_PERIOD", 1e6, "s"),
     ),
     lead=16,
 )
@@ -212,7 +213,7 @@ def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
         fifo_ack_seq=counts["FIFO_ACK_SEQ"],
         fifo_result=counts["FIFO_RESULT"],
         probe=ProbeState(fitted=bool(counts["PROBE_BITS"] & 1), deflected=bool(counts["PROBE_BITS"] & 2)),
-        latch=Latch((u, v, w), counts["LATCH_US"]),
+        latch=Latch((u, v, w), counts["LATCH_US"], STATUS.physical("LATCH_PERIOD", counts["LATCH_PERIOD"])),
         latch_seq=counts["LATCH_SEQ"],
     )
 

@@ -27,9 +27,10 @@ KINDS = ("bar", "laser", "artefact")
 """Instruments whose noise is estimated separately."""
 NOISE_SD = 2.0
 """Weak hyperprior of an instrument's log noise variance about the expected one: a factor of e in the standard deviation."""
-LEAST_ETA = -8.0
-"""Least log ratio of noise variance to expected one, a factor of 55 in the standard deviation and below any instrument's resolution.
-Readings without noise would drive it to minus infinity, and the normal equations beyond double precision."""
+LEAST_ETA: F1 = np.array([0.0 if kind == "artefact" else -8.0 for kind in KINDS])
+"""Least log ratio of noise variance to expected one by instrument. A factor of 55 in the standard deviation is below any resolution;
+readings without noise would drive it to minus infinity, and the normal equations beyond double precision. Points of artefacts state what
+they repeat: with a free form few poses would fit any scatter, the resolution of the touch included."""
 CLEAR = 1.5
 """Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25
@@ -272,8 +273,7 @@ def _inward(gradient: F1, info: F2, c: Components, model: SizeModel) -> F1:
 
 
 def _bounds(c: Components, model: SizeModel) -> tuple[F1, F1]:
-    least, none = np.full(c.eta.size, LEAST_ETA), np.full(c.eta.size, np.inf)
-    return np.concatenate([model.low, least]), np.concatenate([model.high, none])
+    return np.concatenate([model.low, LEAST_ETA]), np.concatenate([model.high, np.full(c.eta.size, np.inf)])
 
 
 def _positive(info: F2, least: float) -> F2:

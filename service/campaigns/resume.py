@@ -195,16 +195,18 @@ class _Finder:
                 in_mounting(item, number) if number > 1 else Item(item.test, item.first, anew(item.test, 1), item.test, before=item.before)
             )
         hand = last.step if last.test == label else None
-        kept = item.test.test == ARTEFACT_TEST or await counting(session)
-        records = self._records(label, number) if kept else ()
+        artefact = item.test.test == ARTEFACT_TEST
+        records = self._records(label, number, earlier=artefact) if artefact or await counting(session) else ()
         return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
-    def _records(self, label: str, number: int) -> tuple[dict[str, Any], ...]:
-        """Return the records of the last run of a test in this mounting."""
-        runs = [n for n, one in self._lines.runs.items() if (one.test, one.mounting) == (label, number)]
-        if not runs:
-            return ()
-        return tuple(record for chunk in self._store.chunks.of_run(max(runs), LASER_CHANNEL) for record in decode_json(chunk.payload))
+    def _records(self, label: str, number: int, *, earlier: bool) -> tuple[dict[str, Any], ...]:
+        """Return the records of the last run of a test in this mounting; ``earlier``: of the last one that has any."""
+        runs = sorted((n for n, one in self._lines.runs.items() if (one.test, one.mounting) == (label, number)), reverse=True)
+        for run in runs if earlier else runs[:1]:
+            found = [record for chunk in self._store.chunks.of_run(run, LASER_CHANNEL) for record in decode_json(chunk.payload)]
+            if found:
+                return tuple(found)
+        return ()
 
 
 async def counting(session: Session) -> bool:

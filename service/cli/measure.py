@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collections.abc import AsyncIterator
 
     from abbe.service.compensation.correct import Correction
+    from abbe.service.compensation.gate import PushContext
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import MachineFile
     from abbe.service.devices.session import Session
-    from abbe.service.domain.progress import ProgressSink
     from abbe.service.domain.run import Run
     from abbe.service.sequences.control import Control
     from abbe.service.sequences.recipes.campaigns import RecipeSource
@@ -35,6 +35,10 @@ if TYPE_CHECKING:
 AcceptTable = Annotated[
     bool,
     typer.Option("--accept-table", help="I have looked: the table in force, which this database did not push, is right."),
+]
+CheckOption = Annotated[
+    Path | None,
+    typer.Option("--check", metavar="FILE.toml", help="Verify with these poses of the artefact, not with diagonals and a helix."),
 ]
 RECIPES = "identification, verification, quick-check"
 
@@ -208,6 +212,7 @@ def correct(
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
+    check: CheckOption = None,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -225,6 +230,7 @@ def correct(
     loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     check_certificates(site)
+    poses = checking_poses(site, check)
 
     hints: list[str] = []
 
@@ -234,10 +240,10 @@ def correct(
         store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
-                context = PushContext(session, store, site, sink)
+                context = PushContext(session, store, site, sink, poses=poses)
                 control = await check_preconditions(context)
                 hints.append(control.hint)
-                runs = await verification_before(session, store, site, before, sink)
+                runs = await verification_before(context, before)
                 async with rollback_when_safe(session, store, site, wait_s):
                     return await work_correct(context, campaign, runs, control)
 
@@ -265,19 +271,27 @@ def say_correction(found: Correction, hints: list[str], machine: Path | None, *,
     raise typer.Exit(0 if kept else 1)
 
 
-async def verification_before(session: Session, store: Store, site: Site, campaign: str, sink: ProgressSink) -> list[Run]:
+def checking_poses(site: Site, check: Path | None) -> CampaignPlan | None:
+    """Return the poses of an artefact in a recipe that verify a table in place of diagonals and a helix; None without a recipe."""
+    from abbe.service.sequences.recipes.artefact import verifying_poses
+    from abbe.service.sequences.recipes.recipe_file import read_recipe
+
+    return None if check is None else verifying_poses(site.machine, *read_recipe(check))
+
+
+async def verification_before(context: PushContext, campaign: str) -> list[Run]:
     """Return the runs of a verification with the present table: those of the named campaign, or, without a name, runs measured now."""
     from abbe.service.campaigns.measure import measure as work_measure
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposals import load_runs
     from abbe.service.sequences.check import paced
-    from abbe.service.sequences.recipes.campaigns import verification
 
+    store, site = context.store, context.site
     if campaign:
         ids = [r.id for r in store.runs.all(campaign) if r.visible_status == "complete"]
     else:
-        plan = paced(verification(site.machine, name=f"verify-before {SystemClock().utc():%Y-%m-%d %H:%M:%S}"), site.max_feed_mm_min)
-        ids = await work_measure(session, store, site, plan, progress=sink)
+        plan = paced(context.verification(f"verify-before {SystemClock().utc():%Y-%m-%d %H:%M:%S}"), site.max_feed_mm_min)
+        ids = await work_measure(context.session, store, site, plan, progress=context.progress)
     return await load_runs(store, ids)
 
 

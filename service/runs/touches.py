@@ -2,7 +2,8 @@
 
 A record of one feature: ``feature``, ``inside`` (a hole), ``nominal_mm`` (artefact axes), ``target_mm`` (axis position expected for its
 centre), ``sides`` (unit vectors from the centre to each touch, machine axes), ``touches_mm`` (for each side the repeated latched axis
-positions), ``start_deg`` (direction of the first touch), ``ctrl_us``, ``feed_mm_min``, ``temperature_C`` where one is known.
+positions), ``start_deg`` (direction of the first touch), ``ctrl_us``, ``feed_mm_min``, ``resolution_mm`` (way between two looks of the
+control at the probe; absent or 0: none), ``temperature_C`` where one is known.
 """
 
 from __future__ import annotations
@@ -53,10 +54,17 @@ def _free(sides: F2) -> F2:
     return np.asarray(rows[size > 0.1 * size[0]])
 
 
+def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> float:
+    """Of the mean of two opposite sides; each resolution is a rectangle (JCGM 100, F.2.2.1)."""
+    return max(float(np.hypot(spread_mm / np.sqrt(2.0 * repeats), resolution_mm / np.sqrt(24.0))), LEAST_U_MM)
+
+
 def touch_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
-    ``u_mm`` is the repeatability of a centre: the pooled spread of repeated touches over the root of the touches along one direction.
+    ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches over
+    the root of the touches, with the way between two looks of the control at the probe, alike in repeated touches. A ball's height,
+    from one side and the radius, is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
     found = [found_feature(record) for record in records]
     pose = start.setup["pose"]
@@ -69,6 +77,6 @@ def touch_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
     for k, a in enumerate("xyz"):
         unsensed = [k == 2 and r["inside"] for r in records]
         doc[f"deviation_{a}_mm"] = [None if u else round(float(d[k]), 7) for d, u in zip(deviation, unsensed, strict=True)]
-    doc["u_mm"] = [max(spread / np.sqrt(2.0 * len(r["touches_mm"][0])), LEAST_U_MM) for r in records]
+    doc["u_mm"] = [_repeatability_mm(spread, len(r["touches_mm"][0]), r.get("resolution_mm", 0.0)) for r in records]
     doc |= {"temperature_C": [r.get("temperature_C") for r in records], "touch_start_deg": [r["start_deg"] for r in records]}
     return Columns.from_document(doc)

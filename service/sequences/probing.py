@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -65,16 +66,18 @@ async def guarded_move(controller: Motion, target: Point, *, feed_mm_min: float,
 
 @dataclass
 class FeatureTouch:
-    """One feature under the probe. ``false_trips``: trips that did not repeat."""
+    """One feature under the probe. ``asked``: whether to leave it before the next touch; ``false_trips``: trips that did not repeat."""
 
     probe: Probing
     step: TouchFeature
+    asked: Callable[[], bool] = lambda: False
     false_trips: int = 0
     out: list[Point] = field(default_factory=list)
     """The way out of the feature, last place first to leave."""
+    _period_s: float = 0.0
 
-    async def run(self) -> dict[str, Any]:
-        """Return the record of the feature (`abbe.service.runs.touches`) without its time.
+    async def run(self) -> dict[str, Any] | None:
+        """Return the record of the feature (`abbe.service.runs.touches`) without its time; None: it was left, as asked.
 
         Raises
         ------
@@ -85,8 +88,11 @@ class FeatureTouch:
         await self._ready()
         await self._rise()
         await self._protected(step.above_mm)
-        touches = []
+        touches: list[list[list[float]]] = []
         for side in step.sides:
+            if touches and self.asked():
+                await self._leave()
+                return None
             try:
                 touches.append(await self._side(side))
             except (MissedContact, FalseTrips):
@@ -98,7 +104,8 @@ class FeatureTouch:
         record: dict[str, Any] = {
             "feature": step.feature, "inside": step.inside, "nominal_mm": list(step.nominal_mm), "target_mm": list(step.centre_mm),
             "sides": [list(s) for s in step.sides], "touches_mm": touches, "start_deg": step.start_deg,
-            "feed_mm_min": step.touch_feed_mm_min, "false_trips": self.false_trips,
+            "feed_mm_min": step.touch_feed_mm_min, "resolution_mm": self._period_s * step.touch_feed_mm_min / 60.0,
+            "false_trips": self.false_trips,
         }  # fmt: skip
         self._check_radius(found_feature(record).radius_mm)
         return record
@@ -139,7 +146,7 @@ class FeatureTouch:
             found.append(latch.position_mm)
             same = [p for p in found if math.dist(p, latch.position_mm) <= AGREE_MM]
             if len(same) >= step.repeats:
-                self.false_trips += len(found) - len(same)
+                self.false_trips, self._period_s = self.false_trips + len(found) - len(same), latch.period_s
                 if step.inside:
                     await self._move(step.centre_mm)
                 return [list(p) for p in same[: step.repeats]]

@@ -152,7 +152,7 @@ class Runner:
                     result |= await self._by_hand(step, k, attempt, watch)
                     self._waited_s += clock() - began
                 else:
-                    result |= await self._step(step, here, recorder)
+                    result |= await self._step(step, here, recorder, watch)
                 await self._reached(step, k, attempt, recorder, watch)
                 done, here = done + seconds, after
                 waited, self._waited_s = self._waited_s, 0.0
@@ -228,6 +228,7 @@ class Runner:
     async def _gone_back(self, attempt: Attempt, recorder: Recorder, watch: Watch) -> Point | None:
         """Return to the last checkpoint along the way that the test came; return the new position, or None if nothing is mounted."""
         resume_trail = attempt.resume_trail
+        self.records = list(resume_trail.carried)  # what fails on the way must not lose them
         if resume_trail.again is not None:
             return await self._same_artefact(resume_trail.again, resume_trail.carried, recorder, watch)
         if not resume_trail.trail:
@@ -259,15 +260,14 @@ class Runner:
                 "laser or mirror was displaced: the set-up is mounted anew",
             )
         for one in carried:
-            await self._kept(one, recorder)
+            await recorder.add_record(one)
         self._points = len(carried)
 
     async def _same_artefact(self, reference: TouchFeature, carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch) -> Point:
         """Touch the first feature again: only an equal place proves an undisturbed artefact. Then keep the earlier features."""
-        await self._safe_place(reference, watch)
-        check_unmoved(await self._touched(reference), list(carried))
+        check_unmoved(await self._touched(reference, watch), list(carried))
         for one in carried:
-            await self._kept(one, recorder)
+            await recorder.add_record(one)
         self._points = len(carried)
         return reference.above_mm
 
@@ -288,7 +288,7 @@ class Runner:
                 return fixture.mount_artefact(origin, matrix)
         return fixture.unmount()
 
-    async def _step(self, step: Step, here: Point | None, recorder: Recorder) -> dict[str, int]:
+    async def _step(self, step: Step, here: Point | None, recorder: Recorder, watch: Watch) -> dict[str, int]:
         match step:
             case MoveTo(target, feed, guarded):
                 await self._move(target, feed, here, guarded=guarded)
@@ -302,7 +302,7 @@ class Runner:
                 settled = await self._settled(step.settle_s)
                 await recorder.add_record(await read_bar(self._s.need_ballbar(), step, settled, here))
             case TouchFeature():
-                record = await self._touched(step)
+                record = await self._touched(step, watch)
                 check_unmoved(record, self.records)
                 await self._kept(record, recorder)
             case FollowPath():
@@ -312,9 +312,12 @@ class Runner:
                 return await self._recorded(step, recorder)
         return {}
 
-    async def _touched(self, step: TouchFeature) -> dict[str, Any]:
-        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by."""
-        record = await FeatureTouch(need_probe(self._s.controller), step).run()
+    async def _touched(self, step: TouchFeature, watch: Watch) -> dict[str, Any]:
+        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by. After a pause it begins anew."""
+        record = None
+        while record is None:
+            await self._safe_place(step, watch)
+            record = await FeatureTouch(need_probe(self._s.controller), step, lambda: self._control.stopping or self._control.pausing).run()
         status = await self._s.controller.status()
         check_interlocks(status)
         air_c = None if self._s.laser is None else (await self._s.laser.peek()).air_temp_c

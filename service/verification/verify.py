@@ -9,7 +9,7 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure
+from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure, same_pose
 from abbe.service.domain.run import ArtefactSetup, Run
 from abbe.service.errors import MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
@@ -87,7 +87,7 @@ def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
     Raises
     ------
     MeasurementFault
-        A run is not one of an artefact of this solution, or is not judged.
+        A run is not one of an artefact of this solution, lies as one that it used, or is not judged.
     """
     poses = {}
     for run in runs:
@@ -96,7 +96,13 @@ def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
             raise MeasurementFault(
                 f"run {run.run_id} is not of an artefact whose form is known", "measure the same artefact in another pose"
             )
-        poses[run.run_id] = pose_figure(run_data(run), known)
+        data = run_data(run)
+        if any(same_pose(data, used) for used in known.data):
+            raise MeasurementFault(
+                f"run {run.run_id} is in a pose that the solution has used: there it says of the form whatever suits the machine",
+                "turn the artefact, or shift it by more than a few mm",
+            )
+        poses[run.run_id] = pose_figure(data, known)
     return VerificationFigures(poses, None, _air_c(runs), frozenset(run.table.crc for run in runs), "pose")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -170,6 +171,66 @@ async def test_stopped_and_resumed_it_goes_on_at_the_feature(place):
     assert found(store) == ALL
     touched = [c for c in b.sim.motions()[before:] if c.kind == "touch"]
     assert len(touched) < 3.5 * 16, "the first feature, the third and the first one again"
+
+
+async def test_resumed_in_vain_it_loses_no_feature(place):
+    """The first resumption misses its first contact and ends without a record of its own."""
+    b, store = place
+    made = plan()
+    with pytest.raises(Stopped):
+        await run(place, made, StopAt(feature_step(made, 2)))
+    b.sim.world.table.stylus.missed = 1
+    with pytest.raises(MissedContact, match="feature A1"):
+        await on(place, made)
+    await on(place, made)
+    assert found(store) == ALL
+    last = store.runs.all()[-1]
+    points = [c.doc["points"] for c in store.checkpoints.of_campaign(last.campaign_id) if c.kind == "point" and c.doc["run"] == last.id]
+    assert min(points) == 3, "two features were kept"
+
+
+async def at_the_twelfth_touch(place: tuple[Bench, Store], made: CampaignPlan, control: Control, do: Callable[[], None]) -> int:
+    """Do something during the fourth touch of the second hole; return the touches afterwards, until the measurement ended."""
+    b, starts = place[0], list[float]()
+    feel, loop = b.sim.world.controller.feel, asyncio.get_running_loop()
+
+    def touched(start, target, feed):
+        if feed == 300.0:
+            starts.append(feed)
+            if len(starts) == 12:
+                loop.call_soon(do)
+        return feel(start, target, feed)
+
+    b.sim.world.controller.feel = touched
+    with suppress(Stopped):
+        await run(place, made, control)
+    b.sim.world.controller.feel = feel
+    return len(starts) - 12
+
+
+async def test_a_stop_waits_for_the_next_side_only_and_takes_the_stylus_out(place):
+    b, store = place
+    made, control = plan(), Control()
+    assert await at_the_twelfth_touch(place, made, control, control.stop) <= 1
+    assert b.sim.world.controller.position_mm[2] == pytest.approx(220.0)
+    await on(place, made)
+    assert found(store) == ALL
+
+
+async def test_a_pause_in_a_feature_begins_it_anew(place):
+    b, store = place
+    heights: list[float] = []
+
+    class Pausing(Control):
+        async def resumed(self) -> None:
+            heights.append(float(b.sim.world.controller.position_mm[2]))
+            self.resume()
+            await super().resumed()
+
+    control = Pausing()
+    assert await at_the_twelfth_touch(place, plan(), control, control.pause) >= 3 * 8
+    assert heights == [pytest.approx(220.0)]
+    assert found(store) == ALL
 
 
 async def aborted_in_the_second_hole(place: tuple[Bench, Store], made: CampaignPlan) -> None:

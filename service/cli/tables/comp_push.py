@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
-from abbe.service.cli.measure import AcceptTable, ready_session, say_correction, verification_before
+from abbe.service.cli.measure import AcceptTable, CheckOption, checking_poses, ready_session, say_correction, verification_before
 from abbe.service.cli.tables.comp_proposals import ProposalArgument
 
 if TYPE_CHECKING:
@@ -26,6 +26,7 @@ def push(
     wait_s: Annotated[
         float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
     ] = 600.0,
+    check: CheckOption = None,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -41,15 +42,16 @@ def push(
 
     loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
+    poses = checking_poses(site, check)
     hints: list[str] = []
 
     async def work(store: Store) -> Correction:
         with display() as sink:
             async with ready_session(store, site, accept_table=accept_table) as session:
-                context = PushContext(session, store, site, sink)
+                context = PushContext(session, store, site, sink, poses=poses)
                 admission = await admit(context, proposal)
                 hints.append(admission.hint)
-                runs = await verification_before(session, store, site, before, sink)
+                runs = await verification_before(context, before)
                 async with rollback_when_safe(session, store, site, wait_s):
                     return await work_push(context, admission, runs)
 

@@ -7,7 +7,7 @@ probe or the artefact has changed meanwhile, and how the pose drifts.
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, dataclass, replace
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -18,7 +18,7 @@ from abbe.models.machine import Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject, Feature
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
-from abbe.service.sequences.steps import MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
+from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
 
 BALL, HOLE = "xyz", "xy"
 Angle = Annotated[float, Limits(ge=-360.0, le=360.0)]
@@ -115,6 +115,14 @@ class ArtefactTest(TestRecipe):
             feature.id, feature.nominal_mm, as_point(centre), radius, _sides(up, start, ball=not inside), inside, _vector(up), clear,
             self.search_mm, self.repeats, self.feed_mm_min, self.touch_feed_mm_min, start,
         )  # fmt: skip
+
+
+def verifying_poses(machine: Machine, name: str, recipes: tuple[object, ...]) -> CampaignPlan:
+    """Return the poses of a recipe as a verification: runs that no solution uses. Raises ConfigError if it holds other tests, or none."""
+    poses = [r for r in recipes if isinstance(r, ArtefactTest)]
+    if not poses or len(poses) < len(recipes):
+        raise ConfigError(f"recipe {name}: a verification by poses has tests of the kind artefact only", "leave the other tests out")
+    return CampaignPlan(name, tuple(replace(r, role="holdout").plan(machine) for r in poses))
 
 
 def _sides(up: Array, start_deg: float, *, ball: bool) -> tuple[tuple[float, float, float], ...]:

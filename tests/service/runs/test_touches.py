@@ -57,6 +57,13 @@ def test_columns_have_deviations_in_the_axes_of_the_artefact_and_no_height_of_a_
     assert columns.further["temperature_C"].tolist() == [21.5]
 
 
+def test_a_control_that_looks_at_the_probe_now_and_then_makes_a_centre_uncertain_by_the_way_between():
+    start = RunStart.from_document({"ctrl0_us": 0, "setup": {"pose": {"origin_mm": [100.0, 80.0, 30.0], "matrix": np.eye(3).tolist()}}})
+    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), resolution_mm=2e-3)], start)
+    late = np.random.default_rng(1).uniform(0.0, 2e-3, (100_000, 2))
+    assert columns.further["u_mm"][0] == pytest.approx(np.std(0.5 * (late[:, 0] - late[:, 1])), rel=0.01)
+
+
 def test_a_laser_less_run_has_no_temperature():
     start = RunStart.from_document({"ctrl0_us": 0, "setup": {"pose": {"origin_mm": [100.0, 80.0, 30.0], "matrix": np.eye(3).tolist()}}})
     columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), ball=True)], start)

@@ -10,7 +10,7 @@ import pytest
 from abbe.service.errors import ConfigError, StrokeError
 from abbe.service.sequences.check import dry_run
 from abbe.service.sequences.nc.blocks import program
-from abbe.service.sequences.recipes.artefact import ArtefactTest
+from abbe.service.sequences.recipes.artefact import ArtefactTest, verifying_poses
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text
 from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, TouchFeature, Unmount
 from tests.faults.sequencer_world import MACHINE, PLATE
@@ -78,3 +78,10 @@ def test_what_cannot_be_touched_is_named(change, what):
 def test_an_nc_program_does_not_touch():
     with pytest.raises(ConfigError, match="does not touch"):
         program("m", CampaignPlan("plate", (TEST.plan(MACHINE),)), MACHINE.stroke_mm)
+
+
+def test_poses_that_verify_a_table_are_kept_out_of_the_solution():
+    plan = verifying_poses(MACHINE, "check", (TEST,))
+    assert [t.role for t in plan.tests] == ["holdout"]
+    with pytest.raises(ConfigError, match="tests of the kind artefact only"):
+        verifying_poses(MACHINE, "check", (TEST, object()))

@@ -59,3 +59,13 @@ def test_an_artefact_of_another_campaign_is_refused(solved_and_last):
     solved, last = solved_and_last
     with pytest.raises(MeasurementFault, match="artefact whose form is known"):
         pose_figures([replace(last, setup=replace(last.setup, artefact="B"))], solved.joint)
+
+
+def test_a_pose_that_the_solution_used_proves_nothing(solved_and_last):
+    solved, last = solved_and_last
+    used = next(r for r in solved.joint.data if r.points is not None and r.points.source == "probe")
+    there = replace(
+        last, run_id="again", setup=replace(last.setup, matrix=used.points.matrix), columns=replace(last.columns, q_mm=used.axes_mm[:25])
+    )
+    with pytest.raises(MeasurementFault, match="a pose that the solution has used"):
+        pose_figures([there], solved.joint)
