@@ -108,7 +108,7 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
         zone=zone,
         machine=status.machine,
         name=lambda key: _named(lang, key),
-        measured=lambda value, key: current().length(value, language.figure(lang, key)[1]),
+        measured=measured,
         stamp=lambda time: formatting.stamp(time, zone),
         ago=lambda time: language.ago(lang, time, status.now_utc),
         due_words=lambda one: language.due(lang, one.due_utc, status.now_utc),
@@ -142,6 +142,15 @@ def points_of(past: Sequence[Verification], key: str, changes: Sequence[datetime
 def _lengths(rows: Sequence[Sequence[str]], *at: int) -> list[list[str]]:
     """Rows of a table, with the µm cells in columns ``at`` converted to the reader's unit."""
     return [[current().length(cell) if k in at else cell for k, cell in enumerate(row)] for row in rows]
+
+
+def measured(value: float | None, key: str, expanded: float | None = None) -> tuple[str, str]:
+    """A figure and its U in the reader's unit, rounded together; dashes for what is not known."""
+    frame = current()
+    unit = language.figure(frame.lang, key)[1]
+    if value is None or not expanded:
+        return frame.length(value, unit), "–"
+    return frame.with_u(value, expanded / 2.0, unit)
 
 
 def _named(lang: str, key: str) -> tuple[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import hypot
 
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.service_records import Signal
@@ -56,14 +57,16 @@ def _signal(one: Signal) -> str:
     frame = current()
     name, unit = language.figure(frame.lang, one.figure)
     value, u = frame.with_u(one.value, one.expanded / 2.0, unit)
-    change = "" if one.baseline is None else frame.length(one.value - one.baseline, unit)
+    change = ("", "")
+    if one.baseline is not None:
+        change = frame.with_u(one.value - one.baseline, hypot(one.expanded / 2.0, one.baseline_u or 0.0), unit)
     known = {
         "figure": name,
         "value": value,
         "u": u,
         "unit": frame.unit(unit),
         "limit": frame.length(f"{one.limit:g}", unit),
-        "change": change,
+        "change": " ± ".join(change),
     }
     text = frame.state("alarm.signal", one.kind)
     return text.format(**known) if text != one.kind else one.text

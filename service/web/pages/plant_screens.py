@@ -30,6 +30,7 @@ from abbe.service.web.api.sources import Sources
 from abbe.service.web.frame import THEMES, current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
+from abbe.service.web.page import measured
 from abbe.service.web.pages.context import PageContext, can_be_stored
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
 from abbe.service.web.units import SYSTEMS
@@ -224,7 +225,7 @@ def _add_fleet(app: FastAPI, context: PageContext, sources: Sources) -> None:
             csv=f"/fleet.csv?{urlencode({'name': name, 'verdict': verdict, 'sort': sort})}",
             ago=lambda utc: language.ago(lang, datetime.fromisoformat(utc), now),
             name=named,
-            measured=lambda value, key: current().length(value, language.figure(lang, key)[1]),
+            measured=measured,
         )
 
     @app.get("/fleet.csv", include_in_schema=False)

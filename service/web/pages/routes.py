@@ -181,7 +181,8 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
             return problem(409, str(error), error.code)
         except NotStored as error:
             return problem(404, error.detail, error.code)
-        return RedirectResponse(f"/proposal?id={number}", 303)
+        # What was signed is usually wanted at once: the screen asks for the push, and the person's touch orders it.
+        return RedirectResponse(f"/proposal?id={number}" + ("" if context.pushes_itself else "&push=ask"), 303)
 
 
 def _approval(fields: dict[str, str]) -> tuple[int, float] | None:

@@ -61,6 +61,12 @@ form?.addEventListener("submit", (event) => {
   dialog.showModal();
 });
 
+if (dialog && new URLSearchParams(location.search).get("push") === "ask") {
+  history.replaceState(null, "", location.href.replace(/&push=ask/, ""));  // asked once, not again when the page is loaded anew
+  dialog.returnValue = "";
+  dialog.showModal();
+}
+
 dialog?.addEventListener("close", async () => {
   if (dialog.returnValue !== "order") return;
   const button = form.querySelector("button");

@@ -24,8 +24,19 @@ export class Traces {
     this.begin({ number: 0, angle_deg: [], rate_hz: 100, duration_s: 1 });
   }
 
+  // As many pixels as the screen has, so that lines and digits are sharp; a later change of size only scales them.
+  fit() {
+    this.dot = globalThis.devicePixelRatio || 1;
+    for (const canvas of [this.strip, this.polar]) {
+      if (!canvas.clientWidth) continue;
+      canvas.width = Math.round(canvas.clientWidth * this.dot);
+      canvas.height = Math.round(canvas.clientHeight * this.dot);
+    }
+  }
+
   begin(path) {
     this.path = path;
+    this.fit();
     this.columns = this.strip.width;
     this.perColumn = Math.max(1, Math.round((STRIP_S * path.rate_hz) / this.columns));
     this.low = new Float32Array(this.columns).fill(NaN);
@@ -84,7 +95,7 @@ export class Traces {
     const { width, height } = this.strip;
     const paint = colours(this.strip);
     pen.clearRect(0, 0, width, height);
-    pen.lineWidth = 1;
+    pen.lineWidth = this.dot;
     pen.strokeStyle = paint.line;
     pen.beginPath();
     for (let k = 1; k < 4; k++) {
@@ -94,10 +105,10 @@ export class Traces {
     pen.stroke();
     if (!this.scale) return;
     pen.fillStyle = paint.text;
-    pen.font = "12px system-ui, sans-serif";
-    pen.fillText(`+${this.scale} ${this.unit.sign}`, 4, 14);
-    pen.fillText("0", 4, height / 2 - 4);
-    pen.fillText(`−${this.scale} ${this.unit.sign}`, 4, height - 6);
+    pen.font = `${12 * this.dot}px system-ui, sans-serif`;
+    pen.fillText(`+${this.scale} ${this.unit.sign}`, 4 * this.dot, 14 * this.dot);
+    pen.fillText("0", 4 * this.dot, height / 2 - 4 * this.dot);
+    pen.fillText(`−${this.scale} ${this.unit.sign}`, 4 * this.dot, height - 6 * this.dot);
     pen.strokeStyle = paint.trace;
     pen.beginPath();
     const begin = Math.max(0, this.column - this.columns + 1);
@@ -128,7 +139,7 @@ export class Traces {
     if (anew) {
       this.drawnPart = 0;
       pen.clearRect(0, 0, width, height);
-      pen.lineWidth = 1;
+      pen.lineWidth = this.dot;
       pen.strokeStyle = paint.line;
       pen.beginPath();
       for (const radius of [zero - 0.14 * width, zero, zero + 0.14 * width]) {
@@ -140,10 +151,16 @@ export class Traces {
       pen.moveTo(middle, 0);
       pen.lineTo(middle, height);
       pen.stroke();
+      if (this.scale) {
+        pen.fillStyle = paint.text;
+        pen.font = `${12 * this.dot}px system-ui, sans-serif`;
+        const rings = [[-0.14, `−${this.scale}`], [0, "0"], [0.14, `+${this.scale} ${this.unit.sign}`]];
+        for (const [off, text] of rings) pen.fillText(text, middle + 4 * this.dot, middle - zero - off * width - 4 * this.dot);
+      }
     }
     if (!this.scale || this.part < 0) return;
     pen.strokeStyle = paint.trace;
-    pen.lineWidth = 1.2;
+    pen.lineWidth = 1.2 * this.dot;
     pen.beginPath();
     let joined = false;
     const from = Math.max(0, this.drawnPart - 1);

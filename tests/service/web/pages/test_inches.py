@@ -34,7 +34,7 @@ from abbe.service.web.units import INCH, METRIC
 from tests.pages_world import Served, as_user
 from tests.service.web.pages.test_rehearsal import PLANS, TOLD
 from tests.service.web.pages.test_result_screens import observed, runs_of
-from tests.service.web.pages.test_screens import HEAVIEST, SVG, static_bytes
+from tests.service.web.pages.test_screens import HEAVIEST, SVG, loaded
 
 UIN, IN = 0.0254, 25.4
 """µm of a µin, mm of an inch."""
@@ -147,7 +147,7 @@ def test_the_budget(running: Served) -> None:
 
 def test_the_picture_of_a_result_has_the_unit_of_its_table(running: Served) -> None:
     page = got(running, f"/result?id={running.filled.solution}")
-    name, value = re.findall(r'data-motion="(\w+)"><th scope="row">\w+</th><td class="n">([\d.]+)</td>', page)[0]
+    name, value = re.findall(r'data-motion="(\w+)"><th scope="row"><a [^>]*>\w+</a></th><td class="n">([\d.]+)</td>', page)[0]
     drawn = re.findall(rf"{name} ([\d.]+) ± [\d.]+ µin", SVG.findall(page)[0])
     assert read(drawn[0]) == pytest.approx(read(value), rel=0.03)
     assert "contribution in µin" in page
@@ -244,4 +244,4 @@ def test_a_live_run_gives_its_script_the_unit() -> None:
 def test_inches_make_no_screen_too_heavy(running: Served) -> None:
     page = got(running, f"/volume?id={running.filled.solution}")
     with as_user(running, "vera") as client:
-        assert static_bytes(client) + len(SVG.sub("", page).encode()) < HEAVIEST
+        assert loaded(client, page) + len(SVG.sub("", page).encode()) < HEAVIEST

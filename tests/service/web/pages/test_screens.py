@@ -80,7 +80,8 @@ def test_who_may_approve(running: Served, filled: Filled, name: str) -> None:
     told = running.store.proposals.approvals(filled.proposals[2])
     assert len(told) == before + may
     if may:
-        assert (told[-1].name, told[-1].login, answer.headers["location"]) == (name, f"user:{name}", f"/proposal?id={filled.proposals[2]}")
+        to = f"/proposal?id={filled.proposals[2]}&push=ask"
+        assert (told[-1].name, told[-1].login, answer.headers["location"]) == (name, f"user:{name}", to)
 
 
 @pytest.mark.parametrize(
