@@ -18,7 +18,7 @@ from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import Machine
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.domain.machine import DeviceUrls
-from abbe.service.domain.run import Columns, Run, parsed_setup
+from abbe.service.domain.run import Columns, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT
 from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.errors import EffectUnknown, Unusable
@@ -175,7 +175,7 @@ def _run(campaign: str, machine: dict[str, Any], test: TestPlan, begins_s: float
         test=test.test,
         role=test.role,
         machine=machine,
-        setup=parsed_setup(test.test, test.setup | {"t_set_s": begins_s}),
+        setup=test.setup.mounted(begins_s),
         columns=Columns(
             t_s=t_s,
             q_mm=q_mm,

@@ -27,6 +27,7 @@ from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session
+from abbe.service.domain.run import LaserSetup
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.runs.recorder import Recorder
 from abbe.service.runs.sample_columns import MM_PER_COUNT
@@ -68,7 +69,8 @@ class Heard:
 def planned_readings(test: TestPlan) -> list[ListenRequest]:
     """Return the readings of a laser test in order. Raises MeasurementFault for a test without laser readings at standstills."""
     here, out = None, list[ListenRequest]()
-    beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), test.setup.get("nominal_beam", (0.0, 0.0, 0.0))))
+    stated = test.setup.nominal_beam if isinstance(test.setup, LaserSetup) else None
+    beam = np.array(next((s.beam for s in test.steps if isinstance(s, MountLaser)), np.zeros(3) if stated is None else stated))
     for step in test.steps:
         if isinstance(step, MoveTo):
             here = step.target_mm

@@ -395,7 +395,7 @@ def live_view(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) 
     if live is None or path is None:
         yield
         return
-    live.begin(test.label, test.test, test.setup, (path.points_mm, path.feed_mm_min, path.rate_hz))
+    live.begin(test.label, test.test, test.bar, (path.points_mm, path.feed_mm_min, path.rate_hz))
     recorder.look = live.take
     try:
         yield
@@ -411,7 +411,7 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
     if not test.mounts:
         set_us = campaign.mounted_us.get(test.setup_id, set_us)
     doc: dict[str, Any] = {
-        "setup": test.setup | {"t_set_s": (set_us - ctrl0_us) * 1e-6},
+        "setup": test.setup.mounted((set_us - ctrl0_us) * 1e-6).document,
         "machine": site.doc,
         "ctrl0_us": ctrl0_us,
         **({} if table is None else {"table": table | {"acting": status.compensation_on}}),

@@ -22,7 +22,7 @@ from abbe.models.solvers.observations import RunData
 from abbe.service.config import read_toml
 from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
-from abbe.service.domain.run import ArtefactSetup, Columns, Run, parsed_setup
+from abbe.service.domain.run import ArtefactSetup, Columns, Run
 from abbe.service.errors import ConfigError, StrokeError
 from abbe.service.runs.artefact_points import artefact_data, calibrated_lengths
 from abbe.service.sequences.check import DryRun, dry_run
@@ -143,7 +143,7 @@ def _expected(site: Site, plan: TestPlan) -> Run:
     doc |= {f"{a}_mm": [s.centre_mm[k] for s in touches] for k, a in enumerate("xyz")}
     doc |= {f"deviation_{a}_mm": [None if k == 2 and s.inside else 0.0 for s in touches] for k, a in enumerate("xyz")}
     doc |= {"u_mm": [U_MM] * len(touches), "touch_start_deg": [s.start_deg for s in touches]}
-    setup = parsed_setup(ARTEFACT_TEST, plan.setup | {"t_set_s": 0.0})
+    setup = plan.setup.mounted(0.0)
     run = Run(
         campaign="plan", run_id=plan.label, test=ARTEFACT_TEST, role="identify", machine=site.doc, setup=setup,
         columns=Columns.from_document(doc),

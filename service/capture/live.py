@@ -8,10 +8,9 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +18,7 @@ from numpy.typing import NDArray
 from abbe.drivers.api import BarBatch, Point, bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
 from abbe.service.domain.progress import RecordedPath
+from abbe.service.domain.run import BarSetup
 from abbe.service.runs.coverage import about_axis, helix_axis
 
 F1 = NDArray[np.float64]
@@ -57,7 +57,7 @@ class LiveFeed:
         self._first_seq: int | None = None
         self._batches: deque[BarBatch] = deque(maxlen=MOST_BATCHES)
 
-    def begin(self, run: str, test: str, setup: Mapping[str, Any], path: tuple[Sequence[Point], float, int]) -> None:
+    def begin(self, run: str, test: str, setup: BarSetup, path: tuple[Sequence[Point], float, int]) -> None:
         """Begin a path, given by its points in mm, feed in mm/min and rate in Hz."""
         points_mm, feed_mm_min, rate_hz = path
         self._number += 1
@@ -70,7 +70,7 @@ class LiveFeed:
             number=self._number,
             run=run[:WORD],
             test=test[:WORD],
-            radius_mm=float(setup["radius_mm"]),
+            radius_mm=setup.radius_mm,
             feed_mm_min=feed_mm_min,
             rate_hz=rate_hz,
             duration_s=duration_s,
@@ -116,18 +116,18 @@ def _cut(path: int, numbers: list[int], values: Values, host_s: float) -> list[S
     return [Stretch(path, numbers[at], host_s, part) for at, part in zip(firsts, np.split(values, firsts[1:]), strict=True)]
 
 
-def angles_along(points_mm: Sequence[Point], setup: Mapping[str, Any]) -> tuple[F1, float]:
+def angles_along(points_mm: Sequence[Point], setup: BarSetup) -> tuple[F1, float]:
     """Return the angle about a ball-bar test's axis at `ANGLES` equally spaced path positions, degrees, unwrapped; and the path length, mm.
 
     Angles count from the first axis of the plane to its second, as in a recipe. The angles are empty if neither set-up nor path defines the
     axis: such a path has no polar plot.
     """
-    points = np.asarray(points_mm, dtype=np.float64) - np.asarray(setup["centre_mm"], dtype=np.float64)
+    points = np.asarray(points_mm, dtype=np.float64) - setup.centre_mm
     arc = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))])
-    if setup.get("plane"):
-        across, up = (points[:, "XYZ".index(letter)] for letter in str(setup["plane"]))
+    if setup.plane:
+        across, up = (points[:, "XYZ".index(letter)] for letter in setup.plane)
         about = np.arctan2(up, across)
-    elif (axis := helix_axis(str(setup.get("axis") or ""), points)) is not None:
+    elif (axis := helix_axis(setup.axis, points)) is not None:
         about = about_axis(points, axis)
     else:
         return np.zeros(0), float(arc[-1])

@@ -30,10 +30,6 @@ DENSER = 2.0
 """Factor on the number of turns of a path through a given place."""
 EQUATOR = 0.05
 """A place below a sphere's equator by less than this (sine of the angle) still belongs to the upper half."""
-KNOWN = (
-    "centre_mm", "radius_mm", "turns", "axis", "opens", "law", "even", "chord_mm", "rate_hz", "length_calibrated", "u_length_mm",
-)  # fmt: skip
-"""Keys of a stored set-up that define its helix: without all of them the path or the bar is unknown."""
 NO_HELIX = "the run is not a helix, and the sequencer can repeat only a helix"
 NO_PATH = "the stored set-up does not define the path of the helix, or the helix was measured with another tool"
 TURNED = "a person has to turn the bar or change its ball in between"
@@ -176,18 +172,20 @@ def _first_helix(machine: Machine, runs: list[Run]) -> Helix | None:
 
 def _recipe_of(machine: Machine, run: Run) -> Helix | None:
     """Turn a stored helix into a recipe; None if its set-up is incomplete or this machine cannot repeat it."""
-    setup, bar = run.setup.document, run.bar
-    if any(setup.get(key) is None for key in KNOWN) or bar.turns is None or bar.u_length_mm is None or bar.turns < MIN_TURNS:
+    bar = run.bar
+    if bar.law is None or bar.rate_hz is None or bar.chord_mm is None or bar.opens is None or bar.even is None or not bar.axis:
+        return None
+    if bar.turns is None or bar.u_length_mm is None or bar.turns < MIN_TURNS:
         return None
     if bar.tool_mm is not None and not np.allclose(bar.tool_mm, machine.tool_mm):
         return None
     columns = run.columns
     return Helix(
         "", "", "identify", as_point(bar.centre_mm), bar.radius_mm,
-        turns=bar.turns, law=setup["law"], axis=AXES.index(bar.axis), feed_mm_min=float(columns.feed_mm_min[0]),
-        direction=1 if columns.direction[0] > 0 else -1, rate_hz=int(setup["rate_hz"]), chord_mm=float(setup["chord_mm"]),
-        opens=1 if setup["opens"] > 0 else -1, length_calibrated=bool(bar.length_calibrated),
-        u_length_mm=bar.u_length_mm, even=bool(setup["even"]),
+        turns=bar.turns, law=bar.law, axis=AXES.index(bar.axis), feed_mm_min=float(columns.feed_mm_min[0]),
+        direction=1 if columns.direction[0] > 0 else -1, rate_hz=bar.rate_hz, chord_mm=bar.chord_mm,
+        opens=bar.opens, length_calibrated=bool(bar.length_calibrated),
+        u_length_mm=bar.u_length_mm, even=bar.even,
     )  # fmt: skip
 
 

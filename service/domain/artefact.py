@@ -9,6 +9,7 @@ from pydantic import AfterValidator, Field, model_validator
 from abbe.service.domain.machine import FileObject, Name, Point, RunFileHead
 
 ARTEFACT_TEST = "artefact_points"
+MACHINE_PROBE = "machine-probe"
 SQUARE = 1e-6
 """A stated matrix is a rotation to this accuracy (components)."""
 

@@ -75,11 +75,18 @@ def record(kind: type[T], doc: object, what: str) -> T:
         The document has another form.
     """
     try:
+        return parsed(kind, doc)
+    except ValueError as error:
+        raise Unusable(f"{what} has another form than expected: {error}", "make it again with this version") from None
+
+
+def parsed(kind: type[T], doc: object) -> T:
+    """Parse a JSON object into a record. Raises ValueError with the first mistake on one line."""
+    try:
         found: T = _adapter(kind).validate_python(doc)
     except ValidationError as error:
         first = mistakes(error.errors())[0]
-        why = f"{what} has another form than expected: {first.path}: {first.message}"
-        raise Unusable(why, "make it again with this version") from None
+        raise ValueError(f"{first.path}: {first.message}") from None
     return found
 
 

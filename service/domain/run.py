@@ -4,14 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Self
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import PlainValidator
 
 from abbe.models.arrays import F1, F2
-from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject
-from abbe.service.domain.document import Doc
+from abbe.models.paths import Law
+from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject
+from abbe.service.domain.document import Doc, parsed
 from abbe.service.domain.run_file import RUN_FORMAT
 from abbe.service.errors import MeasurementFault, StoreError
 
@@ -157,53 +159,65 @@ def _same(one: NDArray[Any], two: NDArray[Any]) -> bool:
     return np.array_equal(one, two, equal_nan=one.dtype.kind == "f" == two.dtype.kind)
 
 
+Vector = Annotated[F1, PlainValidator(_floats)]
+Matrix = Annotated[F2, PlainValidator(_floats)]
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class Setup:
-    """Mounting of an instrument.
+    """Mounting of an instrument, parsed by `parsed_setup`.
 
     ``t_set_s``: time of mounting on the campaign's clock; ``tool_mm`` None: the machine's tool; ``axis``: letter of the axis of a helix
     or of a positioning test; ``document``: all keys as stored, also those without a field, for digests and listings.
     """
 
     setup_id: str
-    t_set_s: float | None
-    tool_mm: F1 | None
-    axis: str
+    t_set_s: float | None = None
+    tool_mm: Vector | None = None
+    axis: str = ""
     document: Doc = field(repr=False)
+
+    def __eq__(self, other: object) -> bool:
+        """Whether both say the same."""
+        return isinstance(other, Setup) and self.document == other.document
 
     def mounted(self, t_set_s: float) -> Self:
         """The same set-up with this time of mounting, s."""
         return replace(self, t_set_s=t_set_s, document=self.document | {"t_set_s": t_set_s})
+
+    def named(self, setup_id: str) -> Self:
+        """The same set-up under another name."""
+        return replace(self, setup_id=setup_id, document=self.document | {"setup_id": setup_id})
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class BarSetup(Setup):
     """Mounting of a ball-bar: the cup's centre, the bar, and the path about it.
 
-    ``turns``: number of turns of a helix; ``plane``, ``span_deg``: plane and covered angle of a circle.
+    ``turns``: number of turns of a helix; ``plane``, ``span_deg``: plane and covered angle of a circle; ``opens``: side of the pole on
+    ``axis``, where the spindle is; ``samples``: of a reading at standstill, None for a continuous path. ``law``, ``even``, ``chord_mm``,
+    ``rate_hz``: what else it takes to drive the same path again.
     """
 
-    centre_mm: F1
+    centre_mm: Vector
     radius_mm: float
-    turns: float | None
-    plane: str
-    span_deg: float
-    length_calibrated: bool | None
-    u_length_mm: float | None
+    turns: float | None = None
+    plane: str = ""
+    span_deg: float = 360.0
+    length_calibrated: bool | None = None
+    u_length_mm: float | None = None
+    opens: Literal[1, -1] | None = None
+    under_the_cup: bool = False
+    samples: int | None = None
+    law: Law | None = None
+    even: bool | None = None
+    chord_mm: float | None = None
+    rate_hz: int | None = None
 
-    @classmethod
-    def from_document(cls, doc: Doc) -> Self:
-        """Parse ``setup`` of a ball-bar run."""
-        return cls(
-            **_common(doc),
-            centre_mm=_floats(doc["centre_mm"]),
-            radius_mm=float(doc["radius_mm"]),
-            turns=_number(doc.get("turns")),
-            plane=str(doc.get("plane") or ""),
-            span_deg=float(doc.get("span_deg") or 360.0),
-            length_calibrated=doc.get("length_calibrated"),
-            u_length_mm=_number(doc.get("u_length_mm")),
-        )
+    @property
+    def place_mm(self) -> F1:
+        """Where it stands: the centre of the sphere."""
+        return self.centre_mm
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
@@ -214,33 +228,21 @@ class LaserSetup(Setup):
     empty for a plain one, None if not stated; ``increment_mm``: of a step, by axis; ``overrun_mm``: travel past both ends to turn.
     """
 
-    start_mm: F1 | None
-    end_mm: F1 | None
-    nominal_beam: F1 | None
-    diagonal: str
-    face: str
-    order: str | None
-    steps: int
-    increment_mm: F1 | None
-    cycles: int
-    overrun_mm: float
+    start_mm: Vector | None = None
+    end_mm: Vector | None = None
+    nominal_beam: Vector | None = None
+    diagonal: str = ""
+    face: str = ""
+    order: str | None = None
+    steps: int = 0
+    increment_mm: Vector | None = None
+    cycles: int = 1
+    overrun_mm: float = 0.0
 
-    @classmethod
-    def from_document(cls, doc: Doc) -> Self:
-        """Parse ``setup`` of a laser run."""
-        return cls(
-            **_common(doc),
-            start_mm=_point(doc.get("start_mm")),
-            end_mm=_point(doc.get("end_mm")),
-            nominal_beam=_point(doc.get("nominal_beam")),
-            diagonal=str(doc.get("diagonal") or ""),
-            face=str(doc.get("face") or ""),
-            order=doc.get("order"),
-            steps=int(doc.get("steps") or 0),
-            increment_mm=_point(doc.get("increment_mm")),
-            cycles=int(doc.get("cycles", 1)),
-            overrun_mm=float(doc.get("overrun_mm") or 0.0),
-        )
+    @property
+    def place_mm(self) -> F1:
+        """Where the machine mounts it: the start of the line; raises like `ends_mm`."""
+        return self.ends_mm[0]
 
     @property
     def ends_mm(self) -> tuple[F1, F1]:
@@ -263,56 +265,48 @@ class LaserSetup(Setup):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
+class Pose:
+    """Pose of an artefact; ``matrix``: columns are the artefact's axes in machine axes, shape (3, 3)."""
+
+    origin_mm: Vector
+    matrix: Matrix
+
+
+@dataclass(frozen=True, kw_only=True, eq=False)
 class ArtefactSetup(Setup):
     """Where an artefact lay.
 
-    ``by_machine``: found by the machine's probe, else made by the machine and found by a CMM; ``matrix``: columns are the artefact's axes
-    in machine axes, shape (3, 3). ``features``, ``cmm``: as the campaign states them (`Run.with_artefact`).
+    ``source``: what found its points. ``features``, ``cmm``: as the campaign states them (`Run.with_artefact`).
     """
 
     artefact: str
-    by_machine: bool
-    origin_mm: F1
-    matrix: F2
+    source: str
+    pose: Pose
     features: ArtefactObject | None = None
     cmm: Doc = field(default_factory=dict, repr=False)
 
-    @classmethod
-    def from_document(cls, doc: Doc) -> Self:
-        """Parse ``setup`` of a run of an artefact."""
-        pose, source = doc["pose"], str(doc["source"])
-        return cls(
-            **_common(doc),
-            artefact=str(doc["artefact"]),
-            by_machine=source == "machine-probe",
-            origin_mm=_floats(pose["origin_mm"]),
-            matrix=_floats(pose["matrix"]),
-        )
+    @property
+    def place_mm(self) -> F1:
+        """Axis position of its zero."""
+        return self.pose.origin_mm
+
+    @property
+    def by_machine(self) -> bool:
+        """Whether the machine's probe found the points; else the machine made them and a CMM found them."""
+        return self.source == MACHINE_PROBE
 
 
-def parsed_setup(test: str, doc: Doc) -> BarSetup | LaserSetup | ArtefactSetup:
-    """Parse ``setup`` of a run of this test."""
-    if test == ARTEFACT_TEST:
-        return ArtefactSetup.from_document(doc)
-    return BarSetup.from_document(doc) if test.startswith("ballbar") else LaserSetup.from_document(doc)
+AnySetup = BarSetup | LaserSetup | ArtefactSetup
 
 
-def _common(doc: Doc) -> dict[str, Any]:
-    return {
-        "setup_id": str(doc["setup_id"]),
-        "t_set_s": _number(doc.get("t_set_s")),
-        "tool_mm": _point(doc.get("tool_mm")),
-        "axis": str(doc.get("axis") or ""),
-        "document": doc,
-    }
+def parsed_setup(test: str, doc: Doc) -> AnySetup:
+    """Parse ``setup`` of a run of this test; null counts as missing. Raises ValueError."""
+    kind: type[AnySetup] = ArtefactSetup if test == ARTEFACT_TEST else BarSetup if test.startswith("ballbar") else LaserSetup
+    return parsed(kind, {key: value for key, value in doc.items() if value is not None} | {"document": doc})
 
 
 def _number(value: Any) -> float | None:
     return None if value is None else float(value)
-
-
-def _point(value: Any) -> F1 | None:
-    return None if value is None else _floats(value)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -399,7 +393,7 @@ class Run:
     test: str
     role: str
     machine: Doc = field(repr=False)
-    setup: BarSetup | LaserSetup | ArtefactSetup
+    setup: AnySetup
     columns: Columns = field(repr=False)
     table: RunTable = RunTable()
     timing: RunTiming = RunTiming()

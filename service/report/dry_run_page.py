@@ -6,6 +6,7 @@ import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST
+from abbe.service.domain.run import BarSetup
 from abbe.service.rendering.document import Document, PictureBlock, Section, TextTable
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.rendering.plots.views import DrawnTest, three_views
@@ -54,14 +55,11 @@ def _row(k: int, test: TestPlan, run: DryRun) -> tuple[str, ...]:
 
 
 def _drawn(order: int, test: TestPlan) -> DrawnTest:
-    bar = test.test.startswith("ballbar")
-    path = np.array(_read_places(test))
-    place = test.setup["pose"]["origin_mm"] if test.test == ARTEFACT_TEST else test.setup["centre_mm" if bar else "start_mm"]
-    mount = np.array(place, dtype=np.float64)
-    radius = float(test.setup["radius_mm"]) if bar else 0.0
+    path, setup = np.array(_read_places(test)), test.setup
+    kind, radius = ("bar", setup.radius_mm) if isinstance(setup, BarSetup) else ("laser", 0.0)
     mounted = ", bar mounted here" if any(isinstance(s, MountBar) for s in test.steps) else ""
     text = f"{test.label}: {NAMES.get(test.test, test.test)}{mounted}"
-    return DrawnTest(order, "bar" if bar else "laser", text, path, mount, radius, test.mounts)
+    return DrawnTest(order, kind, text, path, setup.place_mm, radius, test.mounts)
 
 
 def _read_places(test: TestPlan) -> list[Point]:

@@ -45,7 +45,7 @@ def artefact_data(run: Run, setup: ArtefactSetup) -> RunData:
     points = _points(run, setup, setup.features, rows[at], component)
     u = np.asarray(c.further["u_mm"][rows], dtype=np.float64)[at]
     ball = np.array([f.sensed == "xyz" and setup.by_machine for f in _listed(setup.features, names)])[at]
-    height = setup.matrix.T[component][:, 2] ** 2
+    height = setup.pose.matrix.T[component][:, 2] ** 2
     sigma = DEFAULT_SIGMA_MM["artefact"]
     return RunData(
         run.run_id, setup.setup_id, "artefact",
@@ -76,7 +76,7 @@ def _points(
     return ArtefactPoints(
         **_of(artefact, setup.artefact),
         source="probe" if setup.by_machine else "cmm",
-        matrix=setup.matrix,
+        matrix=setup.pose.matrix,
         feature=tuple(f.id for f in listed),
         component=component,
         nominal_mm=np.array([f.nominal_mm for f in listed]),
@@ -105,7 +105,7 @@ def _signs(run: Run, setup: ArtefactSetup, points: ArtefactPoints, rows: NDArray
     stated = [run.columns.further[f"from_{a}"] for a in "xyz" if f"from_{a}" in run.columns.further]
     if len(stated) == 3:
         return np.asarray(np.column_stack(stated)[rows], dtype=np.float64)
-    return -np.sign(np.round(points.normal @ setup.matrix.T, 3)) if setup.by_machine else np.zeros((len(rows), 3))
+    return -np.sign(np.round(points.normal @ setup.pose.matrix.T, 3)) if setup.by_machine else np.zeros((len(rows), 3))
 
 
 def calibrated_lengths(runs: list[Run]) -> tuple[RunData, ...]:

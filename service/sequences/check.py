@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.domain.run import BarSetup
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.recipes.approach import LOW_SHARE, as_point, cup_of
 from abbe.service.sequences.steps import (
@@ -154,7 +155,7 @@ def dry_run(machine: Machine, plan: TestPlan, start_mm: Point | None = None) -> 
 
 def _check_cup(plan: TestPlan) -> None:
     setup = plan.setup
-    if not plan.test.startswith("ballbar") or setup.get("under_the_cup"):
+    if not isinstance(setup, BarSetup) or setup.under_the_cup:
         return
     own = next(
         (k for k, s in enumerate(plan.steps) if isinstance(s, RecordPath | ReadBar)), len(plan.steps)
@@ -162,7 +163,7 @@ def _check_cup(plan: TestPlan) -> None:
     lowest = cup_of(setup).lowest(list(positions(plan.steps[own:])) or [as_point(cup_of(setup).pole)])
     if lowest < -LOW_SHARE:
         raise StrokeError(
-            f"test {plan.label}: the path goes {-lowest * setup['radius_mm']:.0f} mm below the centre of the cup, into its support",
+            f"test {plan.label}: the path goes {-lowest * setup.radius_mm:.0f} mm below the centre of the cup, into its support",
             f"use a partial arc ({LOW_SHARE:g} radii below the centre are allowed), or write under_the_cup = true if there is room",
         )
 

@@ -389,7 +389,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
     opening: tuple[Step, ...] = (Unmount(), *(s for s in first.steps[: k + 1] if not isinstance(s, Unmount)))
     if not any(isinstance(step, MountBar) for step in opening):
         return replace(named, steps=(*opening, *test.steps))
-    return replace(named, steps=(*opening[:-1], MountBar(test.setup["radius_mm"]), *_from_centre(test)))
+    return replace(named, steps=(*opening[:-1], MountBar(test.bar.radius_mm), *_from_centre(test)))
 
 
 def _from_centre(test: TestPlan) -> tuple[Step, ...]:
@@ -397,7 +397,7 @@ def _from_centre(test: TestPlan) -> tuple[Step, ...]:
     first = next(k for k, step in enumerate(test.steps) if isinstance(step, RecordPath | ReadBar))
     near = [s for s in test.steps[:first] if isinstance(s, MoveTo)][-2:]  # beside the path's start, and that start
     start = near[-1]
-    return (*over_pole(cup_of(test.setup), start.target_mm, start.feed_mm_min), *near, *test.steps[first:])
+    return (*over_pole(cup_of(test.bar), start.target_mm, start.feed_mm_min), *near, *test.steps[first:])
 
 
 def anew(test: TestPlan, number: int) -> TestPlan:

@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from abbe.service.domain.run import AnySetup, BarSetup
+
 Point = tuple[float, float, float]
 MAX_PATH_POINTS = 8192
 """Points of the controller's path memory (docs/protocols/cnc.md, FIFO_SIZE)."""
@@ -167,14 +169,14 @@ Step = (
 
 @dataclass(frozen=True, slots=True)
 class TestPlan:
-    """One run: its kind, its set-up document (docs/schemas/run.schema.json), and its steps."""
+    """One run: its kind, its set-up (not mounted yet), and its steps."""
 
     __test__ = False  # not a pytest class
 
     label: str
     test: str
     role: str
-    setup: dict[str, Any] = field(hash=False)
+    setup: AnySetup = field(hash=False)
     steps: tuple[Step, ...]
     artefact: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
     """What is known of the artefact that is probed (`abbe.service.domain.artefact.ArtefactObject`), as in the campaign's document."""
@@ -187,11 +189,17 @@ class TestPlan:
     @property
     def setup_id(self) -> str:
         """Name of the set-up in the plan."""
-        return str(self.setup["setup_id"])
+        return self.setup.setup_id
+
+    @property
+    def bar(self) -> BarSetup:
+        """The set-up of a ball-bar test; AssertionError for another."""
+        assert isinstance(self.setup, BarSetup), self.test
+        return self.setup
 
     def in_setup(self, setup_id: str) -> TestPlan:
         """The same test in a set-up of another name, mounted alike."""
-        return replace(self, setup=self.setup | {"setup_id": setup_id})
+        return replace(self, setup=self.setup.named(setup_id))
 
 
 @dataclass(frozen=True, slots=True)

@@ -145,8 +145,7 @@ def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
         if isinstance(step, ZeroLaser) and k and isinstance(steps[k - 1], MountLaser):
             continue  # one halt for both: the listener would take a program start between them for the measurement
         if mount is not None and k == hang:
-            radius = test.setup["radius_mm"]
-            yield Halt(f"hang in the bar of {radius:g} mm")
+            yield Halt(f"hang in the bar of {test.bar.radius_mm:g} mm")
         if mount is not None and mount < k < hang and isinstance(step, MoveTo | FollowPath):
             step = replace(step, feed_mm_min=min(step.feed_mm_min, feed))
         yield from _step(test, step, here, arcs)
@@ -201,11 +200,11 @@ def _by_hand(step: Step) -> str:
 
 def _path(test: TestPlan, step: RecordPath, arcs: tuple[str, ...]) -> Iterator[Block]:
     """Yield the blocks of a path: exact arcs for a circle, else the polyline."""
-    plane = test.setup.get("plane")
+    plane = test.bar.plane
     if test.test != "ballbar_circle" or plane not in arcs:
         yield from (Go(p, step.feed_mm_min) for a, p in pairwise(step.points_mm) if p != a)
         return
-    points, centre = step.points_mm, test.setup["centre_mm"]
+    points, centre = step.points_mm, test.bar.centre_mm
     a, b = ("XYZ".index(c) for c in plane)
     angles = np.unwrap(np.arctan2([p[b] - centre[b] for p in points], [p[a] - centre[a] for p in points]))
     corners = sorted({0, *(step.measured or (0, 0)), len(points) - 1})

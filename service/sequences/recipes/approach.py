@@ -18,6 +18,7 @@ from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import way_on_sphere
+from abbe.service.domain.run import BarSetup
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
 
 
@@ -193,11 +194,11 @@ def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -
     return [FollowPath(as_points(way), feed_mm_min)]
 
 
-def cup_of(setup: dict[str, Any]) -> Cup:
-    """Return the sphere of a ball-bar test from its set-up document."""
+def cup_of(setup: BarSetup) -> Cup:
+    """Return the sphere of a planned ball-bar test."""
     up = np.zeros(3)
-    up[AXES.index(setup["axis"])] = float(setup["opens"])
-    return Cup(np.array(setup["centre_mm"], dtype=np.float64), float(setup["radius_mm"]), up)
+    up[AXES.index(setup.axis)] = float(setup.opens or 1)
+    return Cup(setup.centre_mm, setup.radius_mm, up)
 
 
 def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[Step]:

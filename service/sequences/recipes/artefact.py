@@ -8,14 +8,16 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, replace
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 import scipy
 from pydantic import Field as Limits
 
 from abbe.models.machine import Machine
-from abbe.service.domain.artefact import ARTEFACT_TEST, ArtefactObject, Feature
+from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject, Feature
+from abbe.service.domain.document import Doc
+from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
 from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
@@ -73,13 +75,13 @@ class ArtefactTest(TestRecipe):
         steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *self._order(touches)]
         if self.unmount:
             steps.append(Unmount())
-        setup: dict[str, Any] = {
-            "setup_id": self.setup_id, "artefact": self.artefact, "source": "machine-probe",
+        setup: Doc = {
+            "setup_id": self.setup_id, "artefact": self.artefact, "source": MACHINE_PROBE,
             "tool_mm": [float(v) for v in machine.tool_mm], "tool_radius_mm": self.stylus_radius_mm,
             "pose": {"origin_mm": list(self.origin_mm), "matrix": matrix.tolist()},
         }  # fmt: skip
         known = {self.artefact: self.plate.model_dump(by_alias=True, exclude_none=True)}
-        return TestPlan(self.label, ARTEFACT_TEST, self.role, setup, tuple(steps), known)
+        return TestPlan(self.label, ARTEFACT_TEST, self.role, parsed_setup(ARTEFACT_TEST, setup), tuple(steps), known)
 
     def _order(self, touches: list[TouchFeature]) -> Iterator[TouchFeature]:
         for k, one in enumerate(touches):

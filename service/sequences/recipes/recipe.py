@@ -6,9 +6,9 @@ axis that begins at the very end of its stroke cannot. A test that mounts someth
 
 from __future__ import annotations
 
-from dataclasses import KW_ONLY, dataclass
+from dataclasses import KW_ONLY, asdict, dataclass
 from itertools import pairwise
-from typing import Annotated, Any, Literal
+from typing import Annotated, Literal
 
 import numpy as np
 from pydantic import Field as Limits
@@ -29,6 +29,8 @@ from abbe.models.paths import (
     target_shares,
     way_on_sphere,
 )
+from abbe.service.domain.document import Doc
+from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import (
     BAR_APPROACH_MM,
@@ -142,7 +144,7 @@ class Helix(CupTest):
         again = {"law": self.law, "even": self.even, "chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
         if measured is not None:
             again |= {"feed_in_deg": self.feed_in_deg, "feed_out_deg": self.feed_out_deg}
-        return TestPlan(self.label, "ballbar_helix", self.role, _setup(self, machine, turns=self.turns) | again, tuple(steps))
+        return _bar_plan(self, "ballbar_helix", machine, {"turns": self.turns}, again, steps)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,7 +191,17 @@ class HelixPoints(CupTest):
         if self.unmount:
             steps.append(Unmount())
         again = {"law": self.law, "points": self.points, "settle_s": self.settle_s, "samples": self.samples, "rate_hz": self.rate_hz}
-        return TestPlan(self.label, "ballbar_helix", self.role, _setup(self, machine, turns=self.turns) | again, tuple(steps))
+        return _bar_plan(self, "ballbar_helix", machine, {"turns": self.turns}, again, steps)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CircleArc:
+    """The arc of a circular test, degrees."""
+
+    begin_deg: float
+    span_deg: float
+    feed_in_deg: float
+    feed_out_deg: float
 
 
 @dataclass(frozen=True, slots=True)
@@ -215,27 +227,27 @@ class Circle(CupTest):
     kind: Literal["circle"] = "circle"
     chord_mm: float = inner(0.5)
 
-    def arc(self) -> dict[str, float]:
+    def arc(self) -> CircleArc:
         """Return start, span, feed-in and feed-out of the arc, degrees, with defaults for fields without a value."""
         upright = AXES[self.axis] in self.plane
         span = self.span_deg if self.span_deg is not None else PARTIAL_DEG if upright else 360.0
         pole = (0.0 if self.plane[0] == AXES[self.axis] else 90.0) + (0.0 if self.opens > 0 else 180.0)
         begin = self.start_deg if self.start_deg is not None else pole - 0.5 * span if upright else 0.0
         lead = PARTIAL_LEAD_DEG if upright else 180.0
-        return {
-            "start_deg": begin if begin < 180.0 else begin - 360.0,
-            "span_deg": span,
-            "feed_in_deg": lead if self.feed_in_deg is None else self.feed_in_deg,
-            "feed_out_deg": lead if self.feed_out_deg is None else self.feed_out_deg,
-        }
+        return CircleArc(
+            begin_deg=begin if begin < 180.0 else begin - 360.0,
+            span_deg=span,
+            feed_in_deg=lead if self.feed_in_deg is None else self.feed_in_deg,
+            feed_out_deg=lead if self.feed_out_deg is None else self.feed_out_deg,
+        )
 
     def path(self) -> Path:
         """Return all points in the order of driving, feed-in and feed-out included."""
         turn, arc = float(self.direction), self.arc()
-        first = arc["start_deg"] if turn > 0 else arc["start_deg"] + arc["span_deg"]
-        parts = np.array([arc["feed_in_deg"], arc["span_deg"], arc["feed_out_deg"]])
+        first = arc.begin_deg if turn > 0 else arc.begin_deg + arc.span_deg
+        parts = np.array([arc.feed_in_deg, arc.span_deg, arc.feed_out_deg])
         chord = max(self.chord_mm, np.deg2rad(parts.sum()) * self.radius_mm / (MAX_PATH_POINTS - 6))
-        begin = first - turn * arc["feed_in_deg"]
+        begin = first - turn * arc.feed_in_deg
         arcs = []
         for span in parts:
             n = int(np.ceil(np.deg2rad(span) * self.radius_mm / chord))
@@ -251,30 +263,28 @@ class Circle(CupTest):
         steps.append(RecordPath(path, self.feed_mm_min, self.rate_hz, self.direction, measured))
         if self.unmount:
             steps.append(Unmount())
-        arc = self.arc()
-        own: dict[str, Any] = {"plane": self.plane, "begin_deg": arc.pop("start_deg")} | arc
-        own |= {"chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
-        if self.under_the_cup:
-            own["under_the_cup"] = True
-        return TestPlan(self.label, "ballbar_circle", self.role, _setup(self, machine) | own, tuple(steps))
+        own = {"plane": self.plane, **asdict(self.arc()), "chord_mm": self.chord_mm, "rate_hz": self.rate_hz}
+        own |= {"under_the_cup": True} if self.under_the_cup else {}
+        return _bar_plan(self, "ballbar_circle", machine, {}, own, steps)
 
 
 BarRecipe = Helix | HelixPoints | Circle
 
 
-def _setup(recipe: BarRecipe, machine: Machine, **own: Any) -> dict[str, Any]:
-    """Return the set-up document of a ball-bar test, with the side of the spindle."""
-    return {
+def _bar_plan(recipe: BarRecipe, test: str, machine: Machine, path: Doc, again: Doc, steps: list[Step]) -> TestPlan:
+    """Return the plan of a ball-bar test; ``again``: what else it takes to drive the same path again."""
+    setup = {
         "setup_id": recipe.setup_id,
         "centre_mm": list(recipe.centre_mm),
         "radius_mm": recipe.radius_mm,
-        **own,
+        **path,
         "length_calibrated": recipe.length_calibrated,
         "u_length_mm": recipe.u_length_mm,
         "tool_mm": [float(v) for v in machine.tool_mm],
         "axis": AXES[recipe.axis],
         "opens": recipe.opens,
     }
+    return TestPlan(recipe.label, test, recipe.role, parsed_setup(test, setup | again), tuple(steps))
 
 
 def _check_turns(label: str, turns: float) -> None:
@@ -336,10 +346,8 @@ class Diagonal(BeamTest):
             out = step_diagonal(start, end, self.steps, self.order, back=False)
         else:
             out = straight_line(start, end, self.steps + 1, back=False)
-        setup: dict[str, Any] = {"setup_id": self.setup_id, "diagonal": self.diagonal, "steps": self.steps}
-        if self.order:
-            setup["order"] = self.order
-        return _laser_plan(self, "laser_diagonal", setup, out)
+        setup = {"diagonal": self.diagonal, "steps": self.steps} | ({"order": self.order} if self.order else {})
+        return _laser_plan(self, "laser_diagonal", setup | _increment(out, self.steps), out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -363,8 +371,9 @@ class FaceDiagonal(BeamTest):
         start, end = face_ends(box, self.plane, self.diagonal, self.at_share)
         letters = ["p", "p", "p"]
         letters["XYZ".index(self.plane[0])] = self.diagonal[0]
-        setup = {"setup_id": self.setup_id, "diagonal": "".join(letters), "face": self.plane, "steps": self.steps}
-        return _laser_plan(self, "laser_diagonal", setup, straight_line(start, end, self.steps + 1, back=False))
+        out = straight_line(start, end, self.steps + 1, back=False)
+        setup = {"diagonal": "".join(letters), "face": self.plane, "steps": self.steps}
+        return _laser_plan(self, "laser_diagonal", setup | _increment(out, self.steps), out)
 
 
 @dataclass(frozen=True, slots=True)
@@ -393,13 +402,18 @@ class Linear(BeamTest):
         out = straight_line(start, end, self.positions, back=False)
         if self.offset_share:
             out = start + target_shares(self.positions, self.offset_share, self.seed)[:, None] * (end - start)
-        return _laser_plan(self, "laser_linear", {"setup_id": self.setup_id, "axis": AXES[self.axis]}, out)
+        return _laser_plan(self, "laser_linear", {"axis": AXES[self.axis]}, out)
 
 
 LaserRecipe = Diagonal | FaceDiagonal | Linear
 
 
-def _laser_plan(recipe: LaserRecipe, test: str, setup: dict[str, Any], out: Array) -> TestPlan:
+def _increment(out: Array, steps: int) -> Doc:
+    """Return the key of the length of one step; overruns are not part of a step."""
+    return {"increment_mm": [float(v) for v in (out[-1] - out[0]) / steps]}
+
+
+def _laser_plan(recipe: LaserRecipe, test: str, own: Doc, out: Array) -> TestPlan:
     places, directions = cycles_of(out, recipe.cycles, recipe.overrun_mm)
     path = [as_point(p) for p in places]
     far = int(np.argmax(np.linalg.norm(places - places[0], axis=1)))
@@ -416,12 +430,11 @@ def _laser_plan(recipe: LaserRecipe, test: str, setup: dict[str, Any], out: Arra
         steps.append(ReadLaser(1 if directions[k] > 0 else -1, recipe.settle_s))
     if recipe.unmount:
         steps.append(Unmount())
-    if test == "laser_diagonal":
-        setup["increment_mm"] = [float(v) for v in (out[-1] - out[0]) / setup["steps"]]  # overruns are not part of a step
+    setup: Doc = {"setup_id": recipe.setup_id} | own
     setup |= {"start_mm": list(path[0]), "end_mm": list(path[far]), "nominal_beam": [float(v) for v in beam]}
     if recipe.cycles > 1 or recipe.overrun_mm:
         setup |= {"cycles": recipe.cycles, "overrun_mm": recipe.overrun_mm}
-    return TestPlan(recipe.label, test, recipe.role, setup, tuple(steps))
+    return TestPlan(recipe.label, test, recipe.role, parsed_setup(test, setup), tuple(steps))
 
 
 Recipe = BarRecipe | LaserRecipe | ArtefactTest

@@ -109,9 +109,9 @@ def set_ups(plan: CampaignPlan) -> tuple[SetUp, ...]:
 def _set_up(test: TestPlan) -> tuple[str, str, tuple[float, ...], float] | None:
     for step in test.steps:
         if isinstance(step, MountBar):
-            return "bar", test.label, tuple(test.setup["centre_mm"]), step.radius_mm
+            return "bar", test.label, tuple(test.setup.place_mm.tolist()), step.radius_mm
         if isinstance(step, MountLaser):
-            return "laser", test.label, tuple(test.setup["start_mm"]), 0.0
+            return "laser", test.label, tuple(test.setup.place_mm.tolist()), 0.0
     return None
 
 

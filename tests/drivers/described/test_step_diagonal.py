@@ -90,7 +90,7 @@ async def solved(url: str, world: World | LineWorld, tmp_path: Path) -> dict[str
     parts = blocks(nc_program(here.name, here.machine, plan, "linuxcnc", here.nc).text)
     runs = dict(zip(DIAGONALS, parts[1::2], strict=True))
     starts = dict(zip(DIAGONALS, (part[-1][1] for part in parts[::2] if part), strict=True))
-    beams = {test.label: np.array(test.setup["nominal_beam"]) for test in plan.tests}
+    beams = {test.label: test.setup.nominal_beam for test in plan.tests}
 
     def operator(text: str) -> None:
         label = text.partition(":")[0]

@@ -18,4 +18,4 @@ def test_fewer_than_three_turns_are_refused_before_anything_moves(turns):
 
 def test_three_turns_are_planned():
     plan = Helix("h", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=3).plan(MACHINE)
-    assert plan.setup["turns"] == 3
+    assert plan.bar.turns == 3

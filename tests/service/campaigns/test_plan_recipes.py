@@ -159,10 +159,10 @@ def test_a_bar_is_as_well_known_as_the_instruments_file_says(tmp_path):
     (tmp_path / "i.toml").write_text("bar_length_u_um = 0.7\nlaser = false\nbar_lengths_mm = [150.0]\n")
     found = plan_for(site(), minutes=5.0, tools=read_instruments(tmp_path / "i.toml"))
     recipes = parse_recipe(found.text, "f")[1]
-    assert {r.plan(MACHINE).setup["u_length_mm"] for r in recipes} == {0.0007}
+    assert {r.plan(MACHINE).bar.u_length_mm for r in recipes} == {0.0007}
     loose = Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0, length_calibrated=False, u_length_mm=0.05)
-    assert parse_recipe(recipe_text("n", (loose,)), "f")[1][0].plan(MACHINE).setup["length_calibrated"] is False
-    assert Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0).plan(MACHINE).setup["u_length_mm"] == 0.002
+    assert parse_recipe(recipe_text("n", (loose,)), "f")[1][0].plan(MACHINE).bar.length_calibrated is False
+    assert Helix("a", "S1", "identify", (300.0, 250.0, 50.0), 150.0).plan(MACHINE).bar.u_length_mm == 0.002
 
 
 def test_a_slow_machine_gets_a_plan_that_it_may_run():

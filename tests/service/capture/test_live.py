@@ -11,12 +11,13 @@ from abbe.service.capture.live import ANGLES, LONGEST, MOST_BATCHES, LiveFeed, a
 from abbe.service.channel.messages import LARGEST_B, encode
 from abbe.service.clock import SystemClock
 from abbe.service.core.web_process import _message
+from abbe.service.domain.run import BarSetup
 from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.sequences.recipes.recipe import Circle, Helix
 from abbe.service.sequences.steps import RecordPath
 
 SYNC, OUT = 0b1000, 0b0001
-SETUP = {"centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0, "axis": "Z"}
+SETUP = BarSetup(setup_id="A", centre_mm=np.zeros(3), radius_mm=100.0, axis="Z", document={})
 QUARTER = [(100.0 * float(np.cos(a)), 100.0 * float(np.sin(a)), 0.0) for a in np.linspace(0.0, np.pi / 2, 91)]
 
 
@@ -90,5 +91,5 @@ def test_angles_go_as_often_round_as_the_recipe_s() -> None:
     ):
         test = recipe.plan(machine)
         (path,) = (step for step in test.steps if isinstance(step, RecordPath))
-        angles, _ = angles_along(path.points_mm, test.setup)
+        angles, _ = angles_along(path.points_mm, test.bar)
         assert angles[-1] - angles[0] == pytest.approx(turned, abs=3.0)

@@ -81,7 +81,7 @@ def check_mounted_anew(tests: tuple[TestPlan, ...], suffix: str) -> None:
     assert set(kinds[3:-1]) == {MoveTo}  # over the pole to the start
     assert kinds[-1] is RecordPath
     assert [t.label for t in tests[:3]] == [f"{label}{suffix}" for label in LABELS]
-    assert {t.setup["setup_id"] for t in tests[:3]} == {f"n1-late{suffix}"}
+    assert {t.setup_id for t in tests[:3]} == {f"n1-late{suffix}"}
     assert [t.mounts for t in tests[:3]] == [True, False, False]
     assert not any(isinstance(t.steps[0], Unmount) for t in tests[1:])
 

@@ -9,6 +9,7 @@ from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
 from abbe.service.discovery.effect_pages import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
+from abbe.service.domain.run import BarSetup
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
 from abbe.service.site import machine_from_doc
@@ -17,7 +18,7 @@ from tests.service.discovery.discovery_bench import MACHINE, Doc
 
 HELIX: Doc = {
     "test": "ballbar_helix",
-    "setup": Helix("a", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=4).plan(machine_from_doc(MACHINE)).setup,
+    "setup": Helix("a", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=4).plan(machine_from_doc(MACHINE)).setup.document,
     "columns": {"feed_mm_min": [1500.0], "direction": [1]},
 }
 
@@ -32,30 +33,30 @@ def test_every_addition_is_planned_or_left_to_a_person(add: str, runs: list[Doc]
     assert found.plan is not None
     assert found.by_hand == ()
     assert found.after_s == (REPEAT_LATE_S if add == "longer_session" else 0.0)
-    assert all(t.label.startswith("n1-") and t.setup["setup_id"].startswith("n1-") for t in found.plan.tests)
+    assert all(t.label.startswith("n1-") and t.setup_id.startswith("n1-") for t in found.plan.tests)
     assert {t.role for t in found.plan.tests} == {"holdout" if add == "judging_run" else "identify"}
 
 
 def test_the_additions_differ_from_the_first_helix_as_they_say() -> None:
     machine = machine_from_doc(MACHINE)
 
-    def path(add: str) -> tuple[RecordPath, Doc]:
+    def path(add: str) -> tuple[RecordPath, BarSetup]:
         plan = next_plan([add], machine, [run_of(HELIX)], name=("x", "n1"), max_feed_mm_min=6000.0).plan
         assert plan is not None
-        return next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)), plan.tests[0].setup
+        return next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)), plan.tests[0].bar
 
     late, setup = path("longer_session")
-    assert (late.feed_mm_min, late.direction, setup["radius_mm"]) == (1500.0, 1, 150.0)
+    assert (late.feed_mm_min, late.direction, setup.radius_mm) == (1500.0, 1, 150.0)
     assert path("second_feed")[0].feed_mm_min == pytest.approx(600.0)
     assert path("opposite_direction")[0].direction == -1
-    assert path("second_radius")[1]["radius_mm"] == pytest.approx(90.0)
+    assert path("second_radius")[1].radius_mm == pytest.approx(90.0)
 
 
 def test_a_centre_without_room_for_a_hemisphere_gets_a_shorter_bar() -> None:
     high = HELIX | {"setup": HELIX["setup"] | {"centre_mm": [300.0, 250.0, 380.0]}}
     plan = next_plan(["second_radius"], machine_from_doc(MACHINE), [run_of(high)], name=("x", "n1"), max_feed_mm_min=6000.0).plan
     assert plan is not None
-    assert plan.tests[0].setup["radius_mm"] == pytest.approx(45.0)
+    assert plan.tests[0].bar.radius_mm == pytest.approx(45.0)
 
 
 @pytest.mark.parametrize("about", [None, Localization(position_mm=(300.0, 250.0, 400.0), runs=("r07",))])
@@ -75,10 +76,10 @@ def test_a_repeat_is_the_run_again_with_all_that_its_set_up_says(about: Localiza
         chord_mm=0.5, opens=-1, length_calibrated=False, u_length_mm=0.05, even=False,
     )  # fmt: skip
     old = like.plan(machine)
-    run = HELIX | {"run_id": "r07", "setup": old.setup, "columns": {"feed_mm_min": [900.0], "direction": [-1]}}
+    run = HELIX | {"run_id": "r07", "setup": old.setup.document, "columns": {"feed_mm_min": [900.0], "direction": [-1]}}
     plan = next_plan(["longer_session"], machine, [run_of(run)], name=("x", "n1"), max_feed_mm_min=6000.0, about=about).plan
     assert plan is not None
-    assert plan.tests[0].setup | {"setup_id": "A"} == old.setup
+    assert plan.tests[0].setup.named("A").document == old.setup.document
     assert next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)) == next(s for s in old.steps if isinstance(s, RecordPath))
 
 
@@ -107,7 +108,7 @@ def test_the_half_of_the_new_sphere_is_the_one_on_which_the_place_is_seen(seen: 
         ["second_radius"], machine_from_doc(MACHINE), [run_of(low)], name=("x", "n1"), max_feed_mm_min=6000.0, about=about
     ).plan
     assert plan is not None
-    assert plan.tests[0].setup["opens"] == opens
+    assert plan.tests[0].bar.opens == opens
     path = np.array(next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)).points_mm)
     assert np.min(np.linalg.norm(path - place, axis=1)) < 12.0
 
@@ -121,11 +122,11 @@ def test_a_place_is_passed_by_a_denser_path_on_a_smaller_sphere() -> None:
     ).plan
     assert plan is not None
     setup = plan.tests[0].setup
-    assert setup["radius_mm"] == pytest.approx(90.0)
-    assert setup["turns"] == 8.0
+    assert setup.radius_mm == pytest.approx(90.0)
+    assert setup.turns == 8.0
     path = np.array(next(s for s in plan.tests[0].steps if isinstance(s, RecordPath)).points_mm)
     assert np.min(np.linalg.norm(path - place, axis=1)) < 12.0
-    assert np.linalg.norm(place - np.array(setup["centre_mm"])) == pytest.approx(90.0, abs=1e-3)
+    assert np.linalg.norm(place - setup.centre_mm) == pytest.approx(90.0, abs=1e-3)
 
 
 def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
@@ -140,8 +141,8 @@ def test_what_came_at_a_moment_is_waited_for_in_one_set_up() -> None:
     ).plan
     assert plan is not None
     assert [t.label for t in plan.tests] == ["n1-late1", "n1-late2", "n1-late3"]
-    assert {t.setup["setup_id"] for t in plan.tests} == {"n1-late"}
-    assert {tuple(t.setup["centre_mm"]) for t in plan.tests} == {(320.0, 240.0, 100.0)}
+    assert {t.setup_id for t in plan.tests} == {"n1-late"}
+    assert {tuple(t.bar.centre_mm) for t in plan.tests} == {(320.0, 240.0, 100.0)}
     paths = [next(s for s in t.steps if isinstance(s, RecordPath)) for t in plan.tests]
     assert [p.direction for p in paths] == [1, -1, 1]
     assert paths[0].points_mm[-1] == paths[1].points_mm[0]  # the bar stays in between

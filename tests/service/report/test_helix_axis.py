@@ -10,7 +10,7 @@ import pytest
 from abbe.models.paths import even_helix_points, helix_points
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.capture.live import angles_along
-from abbe.service.domain.run import Run
+from abbe.service.domain.run import Run, parsed_setup
 from abbe.service.errors import MeasurementFault
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.model import PolarTrace
@@ -68,7 +68,7 @@ def test_a_helix_without_a_stated_axis_is_the_same_picture_everywhere(axis: str,
     assert np.array_equal(np.asarray(trace.angle_deg), other.x)
     assert np.array_equal(np.asarray(trace.deviation_um), other.deviation_um)
     points = np.column_stack([run["columns"][f"{c}_mm"] for c in "xyz"])
-    live, _ = angles_along(points.tolist(), run["setup"])
+    live, _ = angles_along(points.tolist(), parsed_setup("ballbar_helix", run["setup"]))
     assert abs(live[-1] - live[0]) == pytest.approx(5 * 360.0, abs=100.0)  # at the pole there is no angle
     turns = np.abs(np.diff(np.unwrap(np.radians(other.x)))).sum() / (2 * np.pi)
     assert turns == pytest.approx(5.0, abs=0.3)

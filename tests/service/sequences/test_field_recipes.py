@@ -38,7 +38,7 @@ def test_a_circle_with_feed_in_and_out_of_half_a_turn(plane, direction):
     assert angle[first] - angle[0] == pytest.approx(direction * np.pi, abs=1e-6)
     assert angle[-1] - angle[last] == pytest.approx(direction * np.pi, abs=1e-6)
     assert path[first] == pytest.approx(circle_points(np.array(CUP), 150.0, plane, np.zeros(1))[0], abs=1e-4)  # starts at 0 degrees
-    assert plan.setup["plane"] == plane
+    assert plan.bar.plane == plane
     dry_run(MACHINE, plan)
 
 
@@ -66,8 +66,8 @@ def test_feed_in_and_feed_out_touch_the_helix_and_stay_on_its_sphere(direction, 
     way = np.diff(p, axis=0) / np.linalg.norm(np.diff(p, axis=0), axis=1)[:, None]
     for k in measured:  # no sharper a corner at the joints than chords of 1 to 3 mm make on this sphere anyway
         assert way[k - 1] @ way[k] > math.cos(0.03)
-    assert fed.plan(MACHINE).setup["feed_in_deg"] == 20.0
-    assert "feed_in_deg" not in plain.plan(MACHINE).setup
+    assert fed.plan(MACHINE).setup.document["feed_in_deg"] == 20.0
+    assert "feed_in_deg" not in plain.plan(MACHINE).setup.document
 
 
 def test_tests_about_one_cup_are_joined_on_the_sphere_and_never_through_it():
@@ -119,7 +119,7 @@ def test_point_by_point_every_axis_arrives_the_way_its_places_follow_each_other(
                 arrived = np.where(np.abs(moved) > 1e-8, np.sign(moved), arrived)
             here = there
     assert k == 60
-    assert plan.setup["points"] == 60
+    assert plan.setup.document["points"] == 60
 
 
 @pytest.mark.parametrize("cycles", [1, 5])
@@ -160,7 +160,7 @@ def approaches(plan, axis):
 @pytest.mark.parametrize(("plane", "diagonal"), [(p, d) for p, ds in FACES.items() for d in ds])
 def test_the_six_face_diagonals_move_two_axes(plane, diagonal):
     plan = FaceDiagonal("f", "S", "identify", plane, diagonal, steps=8, at_share=0.25, cycles=2, overrun_mm=1.0).plan(MACHINE)
-    start, end = (np.array(plan.setup[k]) for k in ("start_mm", "end_mm"))
+    start, end = plan.setup.ends_mm
     a, b = ("XYZ".index(c) for c in plane)
     assert np.sign(end - start)[[a, b]].tolist() == [1.0 if diagonal[0] == "p" else -1.0, 1.0]
     assert end[3 - a - b] == start[3 - a - b]

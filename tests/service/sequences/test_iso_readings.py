@@ -32,7 +32,7 @@ def line(recipe: Linear, deviation, **setup: Any) -> dict[str, Any]:
     columns = {"t_s": np.arange(n).tolist(), "x_mm": x.tolist(), "y_mm": y.tolist(), "z_mm": z.tolist(), "feed_mm_min": [1000.0] * n}
     columns |= {"direction": d.tolist(), "deviation_mm": (values - values[0]).tolist()}
     head = {"format": "abbe-run/1", "campaign": "c", "run_id": recipe.label, "test": plan.test, "role": "identify", "machine": MACHINE}
-    return head | {"setup": dict(plan.setup) | {"t_set_s": 0.0} | setup, "columns": columns}
+    return head | {"setup": plan.setup.document | {"t_set_s": 0.0} | setup, "columns": columns}
 
 
 def lost(position, direction):

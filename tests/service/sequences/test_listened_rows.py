@@ -94,7 +94,7 @@ async def listened(recipe, lost, monkeypatch):
     monkeypatch.setattr(listen, "_at_start", there)
     recorder, said = Recorder(), []
     end = await listen.listen_to(Devices(heard), recorder, plan, said.append)
-    return plan, laser_columns(recorder.records, RunStart.from_document({"setup": plan.setup})).to_document(), end, said
+    return plan, laser_columns(recorder.records, RunStart.from_document({"setup": plan.setup.document})).to_document(), end, said
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -119,7 +119,7 @@ async def test_the_solvers_see_the_same_travel_as_if_nothing_had_been_lost(monke
     runs = []
     for lost in (set(), {2, 9}):
         plan, columns, _, _ = await listened(KINDS["step diagonal"], lost, monkeypatch)
-        runs.append(run_data(run_of({"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns})))
+        runs.append(run_data(run_of({"run_id": "r", "test": plan.test, "setup": plan.setup.document, "columns": columns})))
     whole, less = runs
     keep = np.setdiff1d(np.arange(len(whole.t_s)), [2, 9])
     assert (less.sign == whole.sign[keep]).all()
@@ -135,9 +135,9 @@ async def test_where_the_first_reading_is_missing_the_others_count_from_the_firs
         )
         about = {"ctrl_us": 1_000_000 * k, "status": COMPENSATED, "signal_permille": 900, "air_temp_c": 20.0, "air_pressure_pa": 101325.0}
         records.append(told | about | {"target_mm": list(one.target_mm), "direction": one.direction, "feed_mm_min": 0.0})
-    columns = laser_columns(records, RunStart.from_document({"setup": plan.setup})).to_document()
+    columns = laser_columns(records, RunStart.from_document({"setup": plan.setup.document})).to_document()
     assert columns["valid"][0] == 0
-    run = {"run_id": "r", "test": plan.test, "setup": plan.setup, "columns": columns}
+    run = {"run_id": "r", "test": plan.test, "setup": plan.setup.document, "columns": columns}
     assert np.abs(run_data(run_of(run)).deviation_mm).max() < 1e-6
 
 

@@ -108,7 +108,7 @@ def test_it_goes_where_the_plan_goes(kind, dialect, require, tmp_path):
             while k < len(moves) and moves[k].kind == "arc":
                 k += 1
             assert k > k0
-            on_arcs(points, here, moves[k0:k], plan.setup, [step.points_mm[i] for i in step.measured or ()])
+            on_arcs(points, here, moves[k0:k], plan.bar, [step.points_mm[i] for i in step.measured or ()])
             here = step.points_mm[-1]
             continue
         for point in [step.target_mm] if isinstance(step, MoveTo) else getattr(step, "points_mm", ()):
@@ -126,14 +126,14 @@ def on_arcs(points, here, arcs, setup, ends):
     for arc in arcs:
         (a, b, across), centre, turn = arc.value
         assert abs(turn) == 1  # no arc is more than a whole turn
-        assert math.dist(centre, (setup["centre_mm"][a], setup["centre_mm"][b])) < WITHIN_MM
+        assert math.dist(centre, (setup.centre_mm[a], setup.centre_mm[b])) < WITHIN_MM
         radii = [math.hypot(p[a] - centre[0], p[b] - centre[1]) for p in (here, arc.at)]
-        assert max(abs(r - setup["radius_mm"]) for r in radii) < WITHIN_MM
+        assert max(abs(r - setup.radius_mm) for r in radii) < WITHIN_MM
         first, last = (math.atan2(p[b] - centre[1], p[a] - centre[0]) for p in (here, arc.at))
         sweep = turn * (last - first) % (2.0 * math.pi)
         while left:
             p = left[0]
-            assert abs(math.hypot(p[a] - centre[0], p[b] - centre[1]) - setup["radius_mm"]) < WITHIN_MM
+            assert abs(math.hypot(p[a] - centre[0], p[b] - centre[1]) - setup.radius_mm) < WITHIN_MM
             assert abs(p[across] - here[across]) < WITHIN_MM
             gone = turn * (math.atan2(p[b] - centre[1], p[a] - centre[0]) - first) % (2.0 * math.pi)
             if gone > sweep + 1e-5 and 2.0 * math.pi - gone > 1e-5:

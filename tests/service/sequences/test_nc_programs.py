@@ -64,7 +64,7 @@ def planned_stops(plan, arcs=("XY", "YZ", "ZX")):
         for step in test.steps:
             if isinstance(step, MoveTo):
                 out.append(step.target_mm)
-            elif isinstance(step, FollowPath) or (isinstance(step, RecordPath) and test.setup.get("plane") not in arcs):
+            elif isinstance(step, FollowPath) or (isinstance(step, RecordPath) and test.bar.plane not in arcs):
                 out += step.points_mm
             elif isinstance(step, RecordPath):
                 out += [("circle", step, test.setup)]
@@ -84,9 +84,9 @@ def test_a_program_read_back_goes_where_the_plan_goes(plan, dialect):
             seen = []
             while k < len(moves) and moves[k].kind == "arc":
                 plane, centre, positive = moves[k].value
-                assert plane == setup["plane"]
+                assert plane == setup.plane
                 axes = ["XYZ".index(c) for c in plane]
-                assert np.array(centre)[axes] == pytest.approx(np.array(setup["centre_mm"])[axes], abs=2e-4)
+                assert np.array(centre)[axes] == pytest.approx(setup.centre_mm[axes], abs=2e-4)
                 assert positive == (step.direction > 0)
                 seen.append(moves[k].at)
                 k += 1

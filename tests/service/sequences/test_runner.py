@@ -10,14 +10,17 @@ from abbe.drivers.api import BarBatch, BarSample, Condition
 from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service.campaigns.measure import OpenCampaign, ProgressReporter, measure_test
 from abbe.service.devices.session import Session
+from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import MeasurementFault
 from abbe.service.sequences.paths import UNDELIVERED, motion_interlock, warnings_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import MountBar, MountLaser, RecordPath, TestPlan, Unmount
 from tests.pretended_status import READY, controller_status
+from tests.run_documents import BAR
 
 RUNS_ON = RecordPath(((0.0, 0.0, 0.0), (1.0, 0.0, 0.0)), 100.0, 100, 1)
-PLAN = TestPlan("h", "ballbar_helix", "identify", {"setup_id": "H"}, (RUNS_ON, Unmount()))
+CUP = parsed_setup("ballbar_helix", BAR)
+PLAN = TestPlan("h", "ballbar_helix", "identify", CUP.named("H"), (RUNS_ON, Unmount()))
 
 
 class FakeController:
@@ -184,7 +187,7 @@ def test_the_time_a_person_takes_does_not_spoil_the_eta():
 
 async def test_only_steps_done_by_hand_count_as_waiting():
     ticks: list[tuple[float, float]] = []
-    plan = TestPlan("m", "ballbar_helix", "identify", {}, (MountBar(150.0), Unmount()))
+    plan = TestPlan("m", "ballbar_helix", "identify", CUP, (MountBar(150.0), Unmount()))
     events: list[str] = []
     await Runner(session(events)).run(plan, None, lambda done, waited: ticks.append((done, waited)))
     assert events == ["mounted", "unmounted"]
@@ -263,7 +266,7 @@ async def test_a_set_up_begins_when_it_is_mounted_and_all_its_runs_say_so():
     ways = [("first", (MountBar(150.0),)), ("second", ()), ("third", (Unmount(),))]
     campaign = OpenCampaign(1, 30_000_000)
     for label, steps in ways:
-        plan = TestPlan(label, "ballbar_helix", "identify", {"setup_id": "A"}, steps)
+        plan = TestPlan(label, "ballbar_helix", "identify", CUP.named("A"), steps)
         assert plan.mounts == (label == "first")
         await measure_test(devices, store, SITE, campaign, plan, lambda *_: None, clock)
     # Asked for the start document, for somebody else's program, by the watcher, for the interlocks, and when it was done.
@@ -271,4 +274,4 @@ async def test_a_set_up_begins_when_it_is_mounted_and_all_its_runs_say_so():
     assert store.ends[0]["mounted_us"] == 300_000_000
     assert [doc["setup"]["t_set_s"] for doc in store.starts] == [30.0, 270.0, 270.0]
     assert all("mounted_us" not in end for end in store.ends[1:])
-    assert TestPlan("l", "laser_linear", "identify", {}, (MountLaser((1.0, 0.0, 0.0)),)).mounts
+    assert TestPlan("l", "laser_linear", "identify", parsed_setup("laser_linear", {"setup_id": "L"}), (MountLaser((1.0, 0.0, 0.0)),)).mounts

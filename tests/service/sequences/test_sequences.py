@@ -9,6 +9,7 @@ import pytest
 
 from abbe.models.machine import Machine
 from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal
+from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run, dry_run_campaign, positions
 from abbe.service.sequences.recipes.campaigns import identification, quick_check, verification
@@ -25,6 +26,7 @@ from abbe.service.sequences.steps import (
     Unmount,
     ZeroLaser,
 )
+from tests.run_documents import BAR
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
@@ -64,7 +66,7 @@ def test_laser_lines_approach_their_start_in_the_direction_of_the_first_motion()
     for recipe in (Diagonal("d", "D", "identify", "npp"), Linear("l", "L", "identify", 0, at_share=(0.15, 0.15))):
         plan = recipe.plan(MACHINE)
         approach, start = (s.target_mm for s in plan.steps[:2] if isinstance(s, MoveTo))
-        end = plan.setup["end_mm"]
+        end = plan.setup.end_mm
         for a in range(3):
             if end[a] != start[a]:
                 assert np.sign(start[a] - approach[a]) == np.sign(end[a] - start[a])
@@ -131,10 +133,10 @@ def test_shipped_campaigns_fit_into_any_machine(chain, stroke):
 
 
 def test_verification_shares_no_centre_radius_or_path_with_the_identification():
-    used = [t.setup for t in identification(MACHINE).tests if t.test == "ballbar_helix"]
-    check = next(t.setup for t in verification(MACHINE).tests if t.test == "ballbar_helix")
-    assert all(u["centre_mm"] != check["centre_mm"] and u["radius_mm"] != check["radius_mm"] for u in used)
-    assert not [t for t in identification(MACHINE).tests if t.test == "laser_diagonal" and not t.setup.get("order")]
+    used = [t.bar for t in identification(MACHINE).tests if t.test == "ballbar_helix"]
+    check = next(t.bar for t in verification(MACHINE).tests if t.test == "ballbar_helix")
+    assert all((u.centre_mm != check.centre_mm).any() and u.radius_mm != check.radius_mm for u in used)
+    assert not [t for t in identification(MACHINE).tests if t.test == "laser_diagonal" and not t.setup.order]
 
 
 def test_a_stroke_exceeded_names_axis_amount_and_remedy_before_anything_moves():
@@ -175,7 +177,10 @@ def test_a_long_helix_gets_longer_chords_and_fits_into_the_controllers_path_memo
 def test_a_path_the_controller_cannot_hold_is_refused_before_anything_moves():
     points = tuple((x, 0.0, 0.0) for x in np.linspace(0.0, 600.0, MAX_PATH_POINTS + 1))
     with pytest.raises(StrokeError, match="test long: the path has 8193 points, the controller holds 8192"):
-        dry_run(MACHINE, TestPlan("long", "ballbar_helix", "identify", {}, (RecordPath(points, 2000.0, 100, 1),)))
+        dry_run(
+            MACHINE,
+            TestPlan("long", "ballbar_helix", "identify", parsed_setup("ballbar_helix", BAR), (RecordPath(points, 2000.0, 100, 1),)),
+        )
 
 
 def test_a_discovery_campaign_s_helices_stay_within_a_quarter_of_a_micrometre_of_their_sphere():
@@ -185,7 +190,7 @@ def test_a_discovery_campaign_s_helices_stay_within_a_quarter_of_a_micrometre_of
         for step in plan.steps:
             if isinstance(step, RecordPath):
                 chord = np.linalg.norm(np.diff(np.array(step.points_mm), axis=0), axis=1).max()
-                assert chord**2 / (8.0 * plan.setup["radius_mm"]) < 2.5e-4, plan.label
+                assert chord**2 / (8.0 * plan.bar.radius_mm) < 2.5e-4, plan.label
     there, back = new_measurement(MACHINE).tests[:2]
     assert (back.label, there.setup, back.mounts) == (BACK, back.setup, False)
     assert not any(isinstance(step, Unmount) for step in there.steps)

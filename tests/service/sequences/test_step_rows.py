@@ -23,10 +23,10 @@ def run(recipe):
         elif isinstance(step, ReadLaser):
             points.append(here)
     at = np.array(points)
-    off = np.stack([2e-5 * at[:, 0] - 2e-5 * at[:, 1], 1e-5 * at[:, 1], 0.0 * at[:, 0]], axis=1) @ np.array(plan.setup["nominal_beam"])
+    off = np.stack([2e-5 * at[:, 0] - 2e-5 * at[:, 1], 1e-5 * at[:, 1], 0.0 * at[:, 0]], axis=1) @ plan.setup.nominal_beam
     columns = {"deviation_mm": (off - off[0]).tolist(), **{f"{a}_mm": at[:, i].tolist() for i, a in enumerate("xyz")}}
     columns["valid"] = [1] * len(at)
-    return {"run_id": plan.label, "test": "laser_diagonal", "setup": plan.setup, "columns": columns}
+    return {"run_id": plan.label, "test": "laser_diagonal", "setup": plan.setup.document, "columns": columns}
 
 
 @pytest.mark.parametrize("how", ["row missing", "row invalid", "row elsewhere"])

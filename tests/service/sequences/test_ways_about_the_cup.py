@@ -12,7 +12,7 @@ from abbe.models.machine import Machine
 from abbe.models.paths import way_on_sphere
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.check import dry_run
-from abbe.service.sequences.recipes.recipe import Circle
+from abbe.service.sequences.recipes.recipe import Circle, CircleArc
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_text, shared_setups
 from abbe.service.sequences.resume_plan import end_of, remounted, rest_of
 from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, RecordPath, TakeBarOut
@@ -96,12 +96,12 @@ def test_from_the_centre_the_way_to_a_low_start_is_over_the_pole(plane, opens):
 
 def test_upright_planes_have_the_partial_arc_unless_the_recipe_says_more():
     arc = Circle("c", "S", "identify", CUP, 150.0, "ZX").arc()
-    assert arc == {"start_deg": -110.0, "span_deg": 220.0, "feed_in_deg": 2.0, "feed_out_deg": 2.0}
-    assert Circle("c", "S", "identify", CUP, 150.0, "YZ").arc()["start_deg"] == -20.0
-    assert Circle("c", "S", "identify", CUP, 150.0, "XY").arc() == {
-        "start_deg": 0.0, "span_deg": 360.0, "feed_in_deg": 180.0, "feed_out_deg": 180.0,
-    }  # fmt: skip
-    assert Circle("c", "S", "identify", CUP, 150.0, "XY", axis=0).arc()["span_deg"] == 220.0
+    assert arc == CircleArc(begin_deg=-110.0, span_deg=220.0, feed_in_deg=2.0, feed_out_deg=2.0)
+    assert Circle("c", "S", "identify", CUP, 150.0, "YZ").arc().begin_deg == -20.0
+    assert Circle("c", "S", "identify", CUP, 150.0, "XY").arc() == CircleArc(
+        begin_deg=0.0, span_deg=360.0, feed_in_deg=180.0, feed_out_deg=180.0
+    )
+    assert Circle("c", "S", "identify", CUP, 150.0, "XY", axis=0).arc().span_deg == 220.0
     for plane, opens, axis in (("YZ", 1, 2), ("ZX", -1, 2), ("XY", -1, 0), ("XY", 1, 1), ("ZX", 1, 0)):
         dry_run(MACHINE, Circle("c", "S", "identify", CUP, 150.0, plane, opens=opens, axis=axis).plan(MACHINE))
 
