@@ -162,7 +162,7 @@ def print_result(out: Console, result: DemoResult) -> None:
     """Print before and after as a table, then the verdict."""
     from rich.table import Table
 
-    from abbe.service.demo.demo_report import demo_json, summary_rows
+    from abbe.service.demo.demo_report import summary_rows, table_factor
 
     table = Table(title=f"Simulated machine {result.seed}: before and after")
     for name in ("figure", "before", "after", "factor", "source"):
@@ -174,7 +174,7 @@ def print_result(out: Console, result: DemoResult) -> None:
             row.name, f"{row.before:.1f}{u0} {row.unit}", f"{row.after:.1f}{u1} {row.unit}", f"{row.factor or 0:.1f}x", row.source
         )
     out.print(table)
-    found = demo_json(result)
-    best, share = found["best_nine_tables_rms_um"], 100 * found["volumetric_factor"]["share"]
+    best, share = result.truths[0].best_nine_tables_rms_um, 100 * table_factor(result).share
     out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their improvement factor was reached")
-    out.print(("kept: " if found.get("kept") else "rolled back: ") + str(found.get("verdict", "")))
+    decision = result.corrected.decision
+    out.print(("kept: " if decision.keep else "rolled back: ") + decision.text)

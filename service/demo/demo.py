@@ -7,10 +7,9 @@ how good the result is.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 from abbe.service.campaigns.measure import measure
 from abbe.service.clock import Clock, SystemClock
@@ -19,14 +18,37 @@ from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.correct import Correction, correct
 from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.demo.simulator_process import running_simulators, sealed_truth
-from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.demo.simulator_process import SealedTruth, SimulatorProcess, running_simulators, sealed_truth
+from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.machine_text import machine_text
 from abbe.service.push.limits import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
-from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
+from abbe.service.verification.verify import figure_rows
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredFigure:
+    """A figure before and after the correction with its standard uncertainty, µm."""
+
+    name: str
+    before: float
+    u_before: float
+    after: float
+    u_after: float
+
+    def to_document(self) -> dict[str, float]:
+        """The value in JSON, under its name."""
+        return {"before": self.before, "u_before": self.u_before, "after": self.after, "u_after": self.u_after}
+
+
+def measured_figures(c: Correction) -> list[MeasuredFigure]:
+    """Return the figures that were measured before and after a correction."""
+    old, new = figure_rows(c.before), figure_rows(c.after)
+    return [MeasuredFigure(name, *old[name], *new[name]) for name in old if name in new]
+
 
 MAX_SAMPLES_PER_S = 6000
 """Largest number of ball-bar samples per wall-clock second, so that a small PC keeps up at high speed."""
@@ -37,19 +59,38 @@ FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Wide limits: the first table of an uncorrected machine changes every correction from zero to its full value."""
 
 
-@dataclass
-class DemoResult:
-    """Results of the demonstration; ``truth_before`` and ``truth_after``: the simulator's sealed truth."""
+@dataclass(kw_only=True)
+class DemoRun:
+    """What every demonstration has: its machine, and the folder for database and machine file."""
 
-    seed: int
-    speed: float
     site: Site
     folder: Path
     started_utc: str
     duration_s: float = 0.0
     correction: Correction | None = None
-    truth_before: dict[str, Any] = field(default_factory=dict)
-    truth_after: dict[str, Any] = field(default_factory=dict)
+
+
+@dataclass(kw_only=True)
+class DemoResult(DemoRun):
+    """Results of a demonstration that corrects; ``truth_before`` and ``truth_after``: the simulator's sealed truth."""
+
+    seed: int
+    speed: float
+    truth_before: SealedTruth | None = None
+    truth_after: SealedTruth | None = None
+
+    @property
+    def corrected(self) -> Correction:
+        """The correction; AssertionError before it."""
+        assert self.correction is not None
+        return self.correction
+
+    @property
+    def truths(self) -> tuple[SealedTruth, SealedTruth]:
+        """The sealed truth before and after; AssertionError before the end."""
+        assert self.truth_before is not None
+        assert self.truth_after is not None
+        return self.truth_before, self.truth_after
 
 
 def bar_rate_hz(speed: float) -> int:
@@ -57,13 +98,10 @@ def bar_rate_hz(speed: float) -> int:
     return next((r for r in (1000, 500, 250, 200, 125, 100, 50, 40, 25, 20, 10) if r * speed <= MAX_SAMPLES_PER_S), 10)
 
 
-def demo_site(ready: dict[str, Any]) -> Site:
+def demo_site(simulator: SimulatorProcess) -> Site:
     """Return the site of a simulated machine: its nominal geometry and the addresses of its devices."""
-    machine = machine_from_doc(ready["machine"])
-    urls = DeviceUrls(ready["cnc"], ready["ballbar"], ready["laser"], ready["fixture"])
-    return Site(
-        "demo-machine", machine, machine_doc("demo-machine", machine), urls, limits=FIRST_TABLE_LIMITS, calibrated_until=CERTIFICATES
-    )
+    name, machine = "demo-machine", simulator.machine
+    return Site(name, machine, machine_doc(name, machine), simulator.urls, limits=FIRST_TABLE_LIMITS, calibrated_until=CERTIFICATES)
 
 
 def write_machine_file(site: Site, folder: Path) -> Path:
@@ -91,9 +129,9 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
     simulator_args = ["--seed", str(seed)]
     args = [*simulator_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]
     async with running_simulators(args) as simulator:
-        site = demo_site(simulator.ready)
+        site = demo_site(simulator)
         write_machine_file(site, folder)
-        result = DemoResult(seed, speed, site, folder, clock.utc().isoformat(timespec="seconds"))
+        result = DemoResult(seed=seed, speed=speed, site=site, folder=folder, started_utc=clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
         try:
             async with open_session(site.urls) as session:

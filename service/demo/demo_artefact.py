@@ -8,7 +8,7 @@ the tables (`abbe comp commission`), the laser only tells the temperature.
 from __future__ import annotations
 
 import asyncio
-from dataclasses import dataclass, field, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,9 @@ from abbe.service.campaigns.measure import measure
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
 from abbe.service.compensation.commission_levels import commission_levels
-from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.correct import correct
 from abbe.service.compensation.gate import PushContext
-from abbe.service.demo.demo import FIRST_TABLE_LIMITS, bar_rate_hz, demo_site, write_machine_file
+from abbe.service.demo.demo import FIRST_TABLE_LIMITS, DemoResult, bar_rate_hz, demo_site, measured_figures, write_machine_file
 from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.artefact import ArtefactObject
@@ -31,7 +31,7 @@ from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.verification.verify import COVERAGE, figure_rows
+from abbe.service.verification.verify import COVERAGE
 
 FORMAT = "abbe-artefact-demo/1"
 CAMPAIGN, BEFORE = "plate", "verify-before"
@@ -39,20 +39,6 @@ HEIGHT_MM = 200.0
 POSES = (((60.0, 60.0), 0.0), ((540.0, 70.0), 90.0), ((148.2, 180.0), 0.0), ((330.0, 200.0), 90.0))
 """Axis position of the plate's zero in X and Y, and its turn; the shifts are no multiples of a screw's lead."""
 CHECK = ((500.0, 420.0), 180.0)
-
-
-@dataclass
-class ArtefactDemo:
-    """Results of the demonstration; ``truth_before`` and ``truth_after``: the simulator's sealed truth, with ``plane_rms_um``."""
-
-    seed: int
-    site: Site
-    folder: Path
-    started_utc: str
-    correction: Correction | None = None
-    truth_before: dict[str, Any] = field(default_factory=dict)
-    truth_after: dict[str, Any] = field(default_factory=dict)
-    duration_s: float = 0.0
 
 
 def pose_plan(
@@ -66,7 +52,7 @@ def pose_plan(
     return CampaignPlan(name, tuple(t.plan(site.machine) for t in tests))
 
 
-async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> ArtefactDemo:
+async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: ProgressSink, clock: Clock | None = None) -> DemoResult:
     """Measure, correct and verify a simulated machine with its own probe; ``folder`` receives database and machine file.
 
     Raises
@@ -78,18 +64,18 @@ async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: Pro
     start, args = clock.monotonic_s(), ["--seed", str(seed)]
     async with running_simulators([*args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
         # one plane is measured, and the tables act at every height: the person who starts this demonstration takes that on
-        site = replace(demo_site(simulator.ready), limits=replace(FIRST_TABLE_LIMITS, beyond=1.0))
+        site = replace(demo_site(simulator), limits=replace(FIRST_TABLE_LIMITS, beyond=1.0))
         write_machine_file(site, folder)
-        result = ArtefactDemo(seed, site, folder, clock.utc().isoformat(timespec="seconds"))
+        result = DemoResult(seed=seed, speed=speed, site=site, folder=folder, started_utc=clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
         try:
             async with open_session(site.urls) as session:
-                await _job(session, store, result, ArtefactObject.read(simulator.ready["artefact"]), progress, speed)
+                assert simulator.artefact is not None
+                await _job(session, store, result, simulator.artefact, progress)
         finally:
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "reading the simulator's sealed truth"))
-    assert result.correction is not None
-    box = touched_box_mm(result.correction.solved.joint)
+    box = touched_box_mm(result.corrected.solved.joint)
     plane = ["--plane", *(f"{v:.3f}" for v in (*box[0], *box[1], box[2, 0]))]
     result.truth_before = await sealed_truth([*args, *plane], None)
     result.truth_after = await sealed_truth([*args, *plane], folder / "active_bank.bin")
@@ -97,7 +83,7 @@ async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: Pro
     return result
 
 
-async def _job(session: Session, store: Store, result: ArtefactDemo, plate: ArtefactObject, progress: ProgressSink, speed: float) -> None:
+async def _job(session: Session, store: Store, result: DemoResult, plate: ArtefactObject, progress: ProgressSink) -> None:
     site = result.site
     check = pose_plan(site, plate, BEFORE, (CHECK,), "holdout")
     await measure(session, store, site, pose_plan(site, plate, CAMPAIGN, POSES, "identify"), progress=progress)
@@ -106,41 +92,37 @@ async def _job(session: Session, store: Store, result: ArtefactDemo, plate: Arte
     await commission_levels(session.controller, store, site)
     await commission(session, store, site, progress=progress)
     result.correction = await correct(
-        PushContext(session, store, site, progress, rate_hz=bar_rate_hz(speed), poses=check), CAMPAIGN, before
+        PushContext(session, store, site, progress, rate_hz=bar_rate_hz(result.speed), poses=check), CAMPAIGN, before
     )
     (result.folder / "active_bank.bin").write_bytes(result.correction.image)
 
 
-def summary_lines(result: ArtefactDemo) -> list[str]:
+def summary_lines(result: DemoResult) -> list[str]:
     """Return the results line by line."""
-    c = result.correction
-    assert c is not None
+    c = result.corrected
     lines = [f"measured: a plate in {len(POSES)} poses, {sum(r.deviation_mm.size for r in c.solved.joint.data)} readings"]
     lines += artefact_lines(c.solved.joint)
     lines += [f"found: {flag.line}" for flag in c.solved.flags]
-    for name, (value, u) in figure_rows(c.before).items():
-        after, u_after = figure_rows(c.after)[name]
-        lines.append(f"{name}: {plain(value)} ± {plain(COVERAGE * u)} -> {plain(after)} ± {plain(COVERAGE * u_after)} (95 %)")
+    for f in measured_figures(c):
+        lines.append(
+            f"{f.name}: {plain(f.before)} ± {plain(COVERAGE * f.u_before)} -> {plain(f.after)} ± {plain(COVERAGE * f.u_after)} (95 %)"
+        )
     lines += [("kept: " if c.decision.keep else "rolled back: ") + c.decision.text]
     lines += [f"tables: {line}" for line in c.not_for_tables]
-    true = [float(t["plane_rms_um"]) for t in (result.truth_before, result.truth_after)]
-    return [*lines, f"sealed truth, rms in this plane: {plain(true[0])} -> {plain(true[1])} µm"]
+    before, after = (plain(t.plane_rms_um) for t in result.truths)
+    return [*lines, f"sealed truth, rms in this plane: {before} -> {after} µm"]
 
 
-def artefact_json(result: ArtefactDemo) -> dict[str, Any]:
+def artefact_json(result: DemoResult) -> dict[str, Any]:
     """Return the JSON output of `abbe demo --artefact --json`."""
-    c = result.correction
-    assert c is not None
-    measured = {
-        name: {"before": v, "u_before": u, "after": figure_rows(c.after)[name][0], "u_after": figure_rows(c.after)[name][1]}
-        for name, (v, u) in figure_rows(c.before).items()
-    }
+    c = result.corrected
+    before, after = result.truths
     return {
         "format": FORMAT,
         "seed": result.seed,
-        "measured": measured,
+        "measured": {f.name: f.to_document() for f in measured_figures(c)},
         "predicted_rms_um": {"before": c.predicted.before_mm * 1e3, "after": c.predicted.after_mm * 1e3, "u": c.predicted.u_model_mm * 1e3},
-        "plane_rms_um": {"before": result.truth_before["plane_rms_um"], "after": result.truth_after["plane_rms_um"]},
+        "plane_rms_um": {"before": before.plane_rms_um, "after": after.plane_rms_um},
         "kept": c.decision.keep,
         "verdict": c.decision.text,
         "poses": artefact_lines(c.solved.joint),
@@ -149,17 +131,16 @@ def artefact_json(result: ArtefactDemo) -> dict[str, Any]:
     }
 
 
-def artefact_report(result: ArtefactDemo) -> Document:
+def artefact_report(result: DemoResult) -> Document:
     """Return the report of the demonstration."""
-    doc = artefact_json(result)
+    c = result.corrected
     rows = [
-        (name, plain(v["before"]), plain(COVERAGE * v["u_before"]), plain(v["after"]), plain(COVERAGE * v["u_after"]))
-        for name, v in doc["measured"].items()
+        (f.name, plain(f.before), plain(COVERAGE * f.u_before), plain(f.after), plain(COVERAGE * f.u_after)) for f in measured_figures(c)
     ]
-    true = doc["plane_rms_um"]
-    rows.append(("sealed truth, rms in the plane", plain(true["before"]), "", plain(true["after"]), ""))
+    before, after = (plain(t.plane_rms_um) for t in result.truths)
+    rows.append(("sealed truth, rms in the plane", before, "", after, ""))
     table = TextTable(("figure, µm", "before", "U (95 %)", "after", "U (95 %)"), tuple(rows))
-    told = Section("What these poses tell", [Lines((*doc["poses"], *doc["flags"]))])
-    sections = (Section("Before and after", [doc["verdict"], table]), told)
+    told = Section("What these poses tell", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
+    sections = (Section("Before and after", [c.decision.text, table]), told)
     title = f"Simulated machine {result.seed}, measured by its own probe"
     return Document(kind="cycle", title=title, sections=sections, signatures=())

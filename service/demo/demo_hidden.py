@@ -16,11 +16,11 @@ from abbe.service.campaign_data.decimation import picked
 from abbe.service.campaigns.measure import measure
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
-from abbe.service.compensation.correct import Correction, correct
+from abbe.service.compensation.correct import correct
 from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.demo.demo import bar_rate_hz, demo_site, write_machine_file
-from abbe.service.demo.simulator_process import running_simulators, sealed_truth
+from abbe.service.demo.demo import DemoRun, bar_rate_hz, demo_site, write_machine_file
+from abbe.service.demo.simulator_process import HiddenTruth, running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_answer import location_doc
@@ -36,7 +36,6 @@ from abbe.service.effects.model_book import current
 from abbe.service.errors import NotObservable, TableRefused
 from abbe.service.rendering.numbers import plain
 from abbe.service.sequences.recipes.campaigns import BACK, discovery_campaign, new_measurement
-from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 MOST = 5000
@@ -44,25 +43,19 @@ MOST = 5000
 CAMPAIGN, ANEW = "discover", "anew"
 
 
-@dataclass
-class HiddenDemo:
+@dataclass(kw_only=True)
+class HiddenDemo(DemoRun):
     """Results of the demonstration, in the order in which they arise.
 
-    ``refused``: why a table was not written; ``truth``: the simulator's sealed truth, read at the end.
+    ``refused``: why a table was not written; ``hidden``: what the machine really hides, known at the end.
     """
 
-    simulator_args: list[str]
-    site: Site
-    folder: Path
-    started_utc: str
     finding: Finding = field(default_factory=lambda: Finding(verdict="unknown"))
     job: DiscoveryJob | None = None
     journal: DiscoveryJournal | None = None
     anew: NewMeasurement | None = None
-    correction: Correction | None = None
     refused: str = ""
-    truth: dict[str, Any] = field(default_factory=dict)
-    duration_s: float = 0.0
+    hidden: HiddenTruth | None = None
 
 
 async def run_hidden_demo(
@@ -87,9 +80,9 @@ async def run_hidden_demo(
     clock = clock or SystemClock()
     start = clock.monotonic_s()
     async with running_simulators([*simulator_args, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
-        site = demo_site(simulator.ready)
+        site = demo_site(simulator)
         write_machine_file(site, folder)
-        result = HiddenDemo(simulator_args, site, folder, clock.utc().isoformat(timespec="seconds"))
+        result = HiddenDemo(site=site, folder=folder, started_utc=clock.utc().isoformat(timespec="seconds"))
         store = await asyncio.to_thread(Store.open, f"sqlite:///{folder / 'abbe.sqlite3'}")
         try:
             async with open_session(site.urls) as session:
@@ -97,7 +90,7 @@ async def run_hidden_demo(
         finally:
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "opening the simulator's sealed truth"))
-    result.truth = await sealed_truth(simulator_args, None)
+    result.hidden = (await sealed_truth(simulator_args, None)).hidden
     result.duration_s = clock.monotonic_s() - start
     return result
 
@@ -189,25 +182,18 @@ def _tables(result: HiddenDemo) -> list[str]:
     return lines + [f"not in the tables: {line}" for line in c.not_for_tables]
 
 
-def hidden_label(truth: dict[str, Any]) -> str | None:
-    """Return the hidden effect as ``name:key``; None if nothing was hidden."""
-    secret = truth.get("hidden")
-    if secret is None:
-        return None
-    return f"{secret['name']}:{secret['key']}" if secret["key"] else str(secret["name"])
-
-
 def judged(result: HiddenDemo) -> tuple[bool, str]:
     """Return whether the answer was right, and a sentence about it.
 
     Right answers: exactly the hidden name and key; ``none`` if nothing is hidden; ``unknown`` if the catalogue lacks the hidden effect.
     """
-    label, finding = hidden_label(result.truth), result.finding
+    finding, secret = result.finding, result.hidden
     named = [e.label for e in finding.effects]
-    if label is None:
+    if secret is None:
         right = finding.verdict == "none"
         return right, "nothing was hidden" + ("" if right else f"; the answer was {', '.join(named) or finding.verdict}")
-    if result.truth["hidden"]["name"] not in {e.name for e in catalogue()}:
+    label = secret.label
+    if secret.name not in {e.name for e in catalogue()}:
         right = finding.verdict == "unknown" and not named
         return right, f"hidden was {label}, which the catalogue does not hold; the answer was {', '.join([finding.verdict, *named])}"
     right = finding.verdict == "named" and named == [label]
@@ -221,10 +207,10 @@ def truth_lines(result: HiddenDemo) -> list[str]:
     """Return the lines that compare the answer with the sealed truth."""
     right, text = judged(result)
     lines = [f"sealed truth: {text}. {'RIGHT' if right else 'WRONG'}."]
-    secret = result.truth.get("hidden")
+    secret = result.hidden
     if secret is not None:
-        values = ", ".join(f"{k} {v:g}" for k, v in secret["parameters"].items())
-        bent = "; its shape deviates from the formula in the catalogue" if secret["wild"] else ""
+        values = ", ".join(f"{k} {v:g}" for k, v in secret.parameters.items())
+        bent = "; its shape deviates from the formula in the catalogue" if secret.wild else ""
         lines.append(f"  its true parameters: {values}{bent}")
     return lines
 
@@ -244,7 +230,7 @@ def hidden_json(result: HiddenDemo) -> dict[str, Any]:
         "anew": None if result.anew is None else asdict(result.anew),
         "tables": None if c is None else {"kept": c.decision.keep, "verdict": c.decision.text, "stays": list(c.not_for_tables)},
         "tables_refused": result.refused or None,
-        "hidden": result.truth.get("hidden"),
+        "hidden": None if result.hidden is None else asdict(result.hidden),
         "right": right,
         "judgement": text,
     }

@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from importlib.metadata import version
-from typing import Any
-
-import numpy as np
+from typing import Any, Literal
 
 from abbe.models.compensation.tables import NineTables
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import JointSolution
 from abbe.service.compensation.correct import Correction
-from abbe.service.demo.demo import DemoResult
+from abbe.service.demo.demo import DemoResult, measured_figures
 from abbe.service.rendering.document import Block, Document, Lines, PictureBlock, Section
 from abbe.service.rendering.model import SETUP_NOTE, ArrowField, TableCurve
 from abbe.service.rendering.numbers import COVERAGE, tidy
@@ -31,56 +30,65 @@ from abbe.service.report.blocks import (
 )
 from abbe.service.report.report_parts import machine_facts
 from abbe.service.report.solution_sections import contributions, parameter_rows, residual_series, solution_runs
-from abbe.service.verification.verify import VerificationFigures, figure_rows
+from abbe.service.verification.verify import VerificationFigures
 
-TRUTH = "sealed truth of the simulator"
+TRUTH: Literal["sealed truth of the simulator"] = "sealed truth of the simulator"
 ALL_OBSERVABLE = (
     "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"
 )
-TRUTH_KEYS = ("max_body_diagonal_um", "volumetric_rms_um", "volumetric_max_um")
+TRUTH_TITLES = {
+    "max_body_diagonal_um": "Largest body diagonal",
+    "volumetric_rms_um": "Volumetric error, rms",
+    "volumetric_max_um": "Volumetric error, maximum",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class TableFactor:
+    """Factor by which the tables reduced the volumetric rms, the largest that nine one-axis tables can, and the reached share of it."""
+
+    reached: float
+    bound: float
+    share: float
+
+
+def table_factor(result: DemoResult) -> TableFactor:
+    """Return the factor of a demonstration, by its sealed truth."""
+    before, after = result.truths
+    best, rms0, rms1 = before.best_nine_tables_rms_um, before.volumetric_rms_um, after.volumetric_rms_um
+    return TableFactor(rms0 / rms1, rms0 / best, best / rms1)
 
 
 def demo_json(result: DemoResult) -> dict[str, Any]:
     """Return the JSON output of `abbe demo --json`: figures of the sealed truth, the best that nine tables can do, measured figures."""
-    before, after = result.truth_before, result.truth_after
-    out: dict[str, Any] = {"format": "abbe-demo/1", "seed": result.seed, "speed": result.speed}
-    out |= {key: {"before": before[key], "after": after[key]} for key in TRUTH_KEYS}
-    best = before["best_nine_tables_rms_um"]
-    rms0, rms1 = before["volumetric_rms_um"], after["volumetric_rms_um"]
-    out["best_nine_tables_rms_um"] = best
-    out["volumetric_factor"] = {"reached": rms0 / rms1, "bound": rms0 / best, "share": best / rms1}
-    out["volumetric_reduction_share"] = (rms0 - rms1) / (rms0 - best)
-    out["source_of_the_above"] = TRUTH + ", rigid motion removed"
-    c = result.correction
-    if c is not None:
-        out["measured"] = {
-            n: {"before": v, "u_before": u, "after": a, "u_after": ua} for n, (v, u), (a, ua) in _measured(c.before, c.after)
-        }
-        p = c.predicted
-        out["predicted_rms_um"] = {"before": p.before_mm * 1e3, "after": p.after_mm * 1e3, "u_model": p.u_model_mm * 1e3}
-        out["kept"], out["verdict"] = c.decision.keep, c.decision.text
-        out["holdout_misfit_um"] = c.holdout_misfit_um
-    out["duration_s"] = round(result.duration_s, 1)
-    return out
-
-
-def _measured(before: VerificationFigures, after: VerificationFigures) -> list[tuple[str, tuple[float, float], tuple[float, float]]]:
-    old, new = figure_rows(before), figure_rows(after)
-    return [(k, old[k], new[k]) for k in old if k in new]
+    c, (before, after) = result.corrected, result.truths
+    best, rms0, rms1 = before.best_nine_tables_rms_um, before.volumetric_rms_um, after.volumetric_rms_um
+    return {
+        "format": "abbe-demo/1",
+        "seed": result.seed,
+        "speed": result.speed,
+        **{key: {"before": getattr(before, key), "after": getattr(after, key)} for key in TRUTH_TITLES},
+        "best_nine_tables_rms_um": best,
+        "volumetric_factor": asdict(table_factor(result)),
+        "volumetric_reduction_share": (rms0 - rms1) / (rms0 - best),
+        "source_of_the_above": TRUTH + ", rigid motion removed",
+        "measured": {f.name: f.to_document() for f in measured_figures(c)},
+        "predicted_rms_um": {
+            "before": c.predicted.before_mm * 1e3, "after": c.predicted.after_mm * 1e3, "u_model": c.predicted.u_model_mm * 1e3,
+        },
+        "kept": c.decision.keep,
+        "verdict": c.decision.text,
+        "holdout_misfit_um": c.holdout_misfit_um,
+        "duration_s": round(result.duration_s, 1),
+    }  # fmt: skip
 
 
 def summary_rows(result: DemoResult) -> list[SummaryRow]:
     """Return the figures before and after: measured ones first, then the sealed truth."""
-    rows = []
-    c = result.correction
-    for name, (v, u), (a, ua) in _measured(c.before, c.after) if c is not None else []:
-        title = _title(name)
-        rows.append(SummaryRow(title, "µm", v, a, u, ua))
-    for key, title in zip(TRUTH_KEYS, ("Largest body diagonal", "Volumetric error, rms", "Volumetric error, maximum"), strict=True):
-        if key in result.truth_before and key in result.truth_after:
-            old, new = float(result.truth_before[key]), float(result.truth_after[key])
-            rows.append(SummaryRow(title, "µm", old, new, source="sealed truth of the simulator"))
-    return rows
+    measured = [SummaryRow(_title(f.name), "µm", f.before, f.after, f.u_before, f.u_after) for f in measured_figures(result.corrected)]
+    before, after = result.truths
+    true = [SummaryRow(title, "µm", getattr(before, key), getattr(after, key), source=TRUTH) for key, title in TRUTH_TITLES.items()]
+    return measured + true
 
 
 def _title(name: str) -> str:
@@ -89,12 +97,6 @@ def _title(name: str) -> str:
     if name == "body_diagonal_um":
         return "Largest body diagonal"
     return f"Body diagonal {name.removeprefix('diagonal_').removesuffix('_um')}"
-
-
-def _arrows(truth: dict[str, Any]) -> ArrowField | None:
-    if "grid_mm" not in truth:
-        return None
-    return ArrowField(np.asarray(truth["grid_mm"], dtype=np.float64), np.asarray(truth["deviation_um"], dtype=np.float64))
 
 
 def _curves(found: VerificationFigures) -> dict[str, tuple[Sequence[float], Sequence[float]]]:
@@ -110,16 +112,8 @@ def _tables(t: NineTables) -> list[TableCurve]:
 
 
 def demo_report(result: DemoResult) -> Document:
-    """Return the report of the demonstration: before and after, parameters, tables, residuals.
-
-    Raises
-    ------
-    ValueError
-        The demonstration ended before a correction.
-    """
-    c = result.correction
-    if c is None:
-        raise ValueError("the demonstration holds no correction to report")
+    """Return the report of the demonstration: before and after, parameters, tables, residuals."""
+    c = result.corrected
     joint = c.solved.joint
     rows, runs = parameter_rows(joint), solution_runs(joint)
     shown = [r for r in rows if r.note != SETUP_NOTE]
@@ -147,7 +141,8 @@ def demo_report(result: DemoResult) -> Document:
 
 
 def _before_and_after(result: DemoResult, c: Correction) -> list[Block]:
-    vectors = volume_pair(_arrows(result.truth_before), _arrows(result.truth_after))
+    before, after = (ArrowField(truth.grid_mm, truth.deviation_um) for truth in result.truths)
+    vectors = volume_pair(before, after)
     caption = "Error vectors over the volume, rigid motion removed; both pictures share one exaggeration and one colour scale."
     diagonals = (
         "Deviation along the body diagonals. Before: dashed; after: solid; all on one ordinate. Where a curve has two branches, they are "

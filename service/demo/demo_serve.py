@@ -71,7 +71,7 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show
         The demonstration failed; the error names cause and remedy. Service and simulators are stopped in any case.
     """
     async with running_simulators(["--seed", str(seed), "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
-        site = demo_site(simulator.ready)
+        site = demo_site(simulator)
         machine_file = write_machine_file(site, folder)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
             show("commissioning proves how the control applies tables: abbe comp commission")
@@ -209,7 +209,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
 
 async def drift(simulator: SimulatorProcess, um_per_m: float = DRIFT_UM_PER_M) -> None:
     """Add a scale error to the simulated machine's X axis."""
-    host, port = str(simulator.ready["fixture"]).removeprefix("fixture+tcp://").rsplit(":", 1)
+    host, port = str(simulator.urls.fixture).removeprefix("fixture+tcp://").rsplit(":", 1)
     reader, writer = await asyncio.open_connection(host, int(port))
     try:
         writer.write(json.dumps({"id": 1, "op": "drift", "axis": "X", "um_per_m": um_per_m}).encode() + b"\n")

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import asyncio
 import json
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from abbe.drivers.errors import run_to_end
+from abbe.models.machine import Machine
 from abbe.service.children import python_command
+from abbe.service.domain.artefact import ArtefactObject
+from abbe.service.domain.document import Doc, parsed, record
+from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.run import Matrix
 from abbe.service.errors import AbbeError
+from abbe.service.site import machine_from_doc
 
 READY_S = 30.0
 STOP_S = 3.0
@@ -30,10 +35,53 @@ class SimulatorError(AbbeError):
 
 @dataclass(frozen=True, slots=True)
 class SimulatorProcess:
-    """A running simulated machine with the content of its ready line."""
+    """A running simulated machine; ``artefact``: what the plate on its table is stated to be."""
 
-    ready: dict[str, Any]
+    machine: Machine
+    urls: DeviceUrls
     pid: int
+    artefact: ArtefactObject | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Ready:
+    """The line that the simulators print once they answer."""
+
+    machine: Doc
+    cnc: str
+    ballbar: str
+    laser: str
+    fixture: str
+    artefact: Doc | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HiddenTruth:
+    """The effect that a simulated machine hides; ``wild``: seed of its deviation from the formula in the catalogue, 0: none."""
+
+    name: str
+    key: str
+    parameters: Mapping[str, float]
+    wild: int
+
+    @property
+    def label(self) -> str:
+        """Name and key."""
+        return f"{self.name}:{self.key}" if self.key else self.name
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SealedTruth:
+    """True errors of a simulated machine, rigid motion removed, µm; vectors at a grid; ``plane_rms_um``: in the plane of an artefact."""
+
+    max_body_diagonal_um: float
+    volumetric_rms_um: float
+    volumetric_max_um: float
+    best_nine_tables_rms_um: float
+    grid_mm: Matrix
+    deviation_um: Matrix
+    plane_rms_um: float | None = None
+    hidden: HiddenTruth | None = None
 
 
 @asynccontextmanager
@@ -55,12 +103,15 @@ async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]
         start_new_session=True,  # Ctrl-C reaches only this process, which stops the axes before the simulators
     )
     try:
-        yield SimulatorProcess(await _ready(process), process.pid)
+        ready = await _ready(process)
+        urls = DeviceUrls(ready.cnc, ready.ballbar, ready.laser, ready.fixture)
+        plate = None if ready.artefact is None else ArtefactObject.read(ready.artefact)
+        yield SimulatorProcess(machine_from_doc(ready.machine), urls, process.pid, plate)
     finally:
         await run_to_end(_end(process))
 
 
-async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
+async def _ready(process: asyncio.subprocess.Process) -> _Ready:
     assert process.stdout is not None
     assert process.stderr is not None
     try:
@@ -69,11 +120,10 @@ async def _ready(process: asyncio.subprocess.Process) -> dict[str, Any]:
     except TimeoutError:
         raise SimulatorError(f"the simulators were not ready within {READY_S:g} s", "this computer may be overloaded: try again") from None
     try:
-        ready: dict[str, Any] = json.loads(line)
+        return parsed(_Ready, json.loads(line))
     except ValueError:
         errors = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
         raise SimulatorError(f"the simulators did not start: {errors[-1] if errors else 'no reason given'}", "check the scenario") from None
-    return ready
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:
@@ -93,7 +143,7 @@ async def _end(process: asyncio.subprocess.Process) -> None:
         transport.close()
 
 
-async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
+async def sealed_truth(args: list[str], bank: Path | None) -> SealedTruth:
     """Read the true errors of the simulated machine, corrected by the table in the file ``bank`` if given. For demonstrations only.
 
     Raises
@@ -115,5 +165,4 @@ async def sealed_truth(args: list[str], bank: Path | None) -> dict[str, Any]:
             await run_to_end(process.wait())
     if process.returncode != 0:
         raise SimulatorError(f"the simulators' truth command failed: {err.decode(errors='replace').strip()}")
-    truth: dict[str, Any] = json.loads(out)
-    return truth
+    return record(SealedTruth, json.loads(out), "the simulators' truth")

@@ -121,7 +121,7 @@ async def rounds_of(seed: int, rounds: int, speed: float, folder: Path) -> list[
     out: list[Round] = []
     truth = await sealed_truth(machine, None)
     async with running_simulators([*machine, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
-        site = replace(demo_site(simulator.ready), watching=PATIENT)
+        site = replace(demo_site(simulator), watching=PATIENT)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
             async with open_session(site.urls) as session:
                 await as_if_commissioned(session.controller, store, site)
@@ -131,9 +131,9 @@ async def rounds_of(seed: int, rounds: int, speed: float, folder: Path) -> list[
                     status = await session.controller.comp_status()
                     bank.write_bytes(await session.controller.read_bank(status.active_bank))
                     after = await sealed_truth(machine, bank)
-                    values = (float(t["volumetric_rms_um"]) for t in (truth, after))
-                    out.append(Round(seed, number, *values, float(truth["best_nine_tables_rms_um"]), diagonals, end, why))
-                    truth = after | {"best_nine_tables_rms_um": truth["best_nine_tables_rms_um"]}
+                    values = (t.volumetric_rms_um for t in (truth, after))
+                    out.append(Round(seed, number, *values, truth.best_nine_tables_rms_um, diagonals, end, why))
+                    truth = after
     return out
 
 

@@ -10,6 +10,7 @@ import pytest
 from abbe.models.discovery.answer import Localization, Significance
 from abbe.service.campaign_data.decimation import picked
 from abbe.service.demo.demo_hidden import HiddenDemo, hidden_json, judged, truth_lines
+from abbe.service.demo.simulator_process import HiddenTruth
 from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
 from abbe.service.effects.model_book import _usual
@@ -30,8 +31,8 @@ def demo(hidden, verdict, *labels):
     finding = Finding(verdict=verdict, effects=tuple(effect(n) for n in labels), location=location)
     gap = GapUm(before_um=2.0, after_um=0.5, floor_um=0.5)
     return HiddenDemo(
-        [], None, Path(), "", finding, None, SimpleNamespace(version=1), NewMeasurement(gap, {"a": gap}),
-        truth={} if hidden is None else {"hidden": hidden},
+        site=None, folder=Path(), started_utc="", finding=finding, journal=SimpleNamespace(version=1),
+        anew=NewMeasurement(gap, {"a": gap}), hidden=hidden and HiddenTruth(**hidden),
     )  # fmt: skip
 
 
