@@ -11,7 +11,6 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
-from abbe.service.channel.messages import PAGE_MEMORY_MB
 from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Point
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
@@ -328,7 +327,7 @@ class Web(ConfigTable):
         description="a reverse proxy on this computer terminates TLS, keeps Host and appends to X-Forwarded-For; its name is in names",
     )
     memory_mb: int = Field(
-        default=PAGE_MEMORY_MB,
+        default=1024,
         ge=512,
         le=65536,
         description="memory limit of the page's process, MiB; the core restarts a process that exceeds it",

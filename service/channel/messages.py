@@ -34,10 +34,8 @@ PROTOCOL = 1
 LARGEST_B = 256 * 1024
 """The longest message, bytes."""
 MOST_JOBS = 50
-PAGE_MEMORY_MB = 1024
-"""Default memory limit of the web process, MiB."""
 
-_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False)
+_STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, defer_build=True)
 
 Steering = Literal["stop", "abort", "pause", "resume"]
 Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]

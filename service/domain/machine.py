@@ -43,7 +43,7 @@ Point = tuple[float, float, float]
 class FileObject(BaseModel):
     """Base of everything in an exchange file: unknown keys are kept, numbers are finite, text is not a number."""
 
-    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True, frozen=True)
+    model_config = ConfigDict(extra="allow", allow_inf_nan=False, strict=True, frozen=True, defer_build=True)
 
     @classmethod
     def read(cls, doc: object) -> Self:
@@ -157,7 +157,7 @@ class AxisMaterial:
 class ConfigTable(BaseModel):
     """A table of the machine file: no unknown key, no NaN, immutable."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
 
 class Issuer(ConfigTable):

@@ -11,7 +11,6 @@ from dataclasses import dataclass, fields
 from functools import cache
 from typing import Any, TypeVar
 
-import structlog
 from pydantic import TypeAdapter, ValidationError
 from sqlalchemy.exc import SQLAlchemyError
 
@@ -19,7 +18,6 @@ from abbe.service.clock import Clock
 from abbe.service.errors import NotStored, StoreError, Unusable
 from abbe.service.storage.store import Store
 
-log = structlog.get_logger("abbe.queries")
 T = TypeVar("T")
 Doc = dict[str, Any]
 MOST = 200
@@ -130,8 +128,12 @@ def as_stored() -> Iterator[None]:
         raise Unusable(error.detail, error.remedy) from error
     except (KeyError, TypeError, ValueError, IndexError) as error:
         # Documents may be imported or written by an older version. A defect of this program would look the same, hence the log.
+        import structlog  # it takes as long as the rest of a short command
+
         at = traceback.extract_tb(error.__traceback__)[-1]
-        log.warning("stored data cannot be used", error=repr(error)[:200], where=f"{at.filename}:{at.lineno}")
+        structlog.get_logger("abbe.queries").warning(
+            "stored data cannot be used", error=repr(error)[:200], where=f"{at.filename}:{at.lineno}"
+        )
         what = f"{type(error).__name__}: {error}"[:200]
         raise Unusable(f"stored data are incomplete or malformed ({what})", "see the service's log") from error
 

@@ -14,11 +14,9 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
-from typing import Any, Generic, ParamSpec, Self, TypeVar, get_type_hints
+from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar, get_type_hints
 
 from sqlalchemy import Column, ColumnElement, Connection, Engine, FromClause, Row, Select, Table, func, insert, null, select, text
-from sqlalchemy.dialects.postgresql import Insert as PostgresInsert
-from sqlalchemy.dialects.postgresql import insert as postgres_insert
 from sqlalchemy.dialects.sqlite import Insert as SqliteInsert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
@@ -32,6 +30,9 @@ from abbe.service.errors import NotStored, StoreError
 from abbe.service.secrets import mask_secrets
 from abbe.service.storage import tables as t
 from abbe.service.storage.engine import DEFAULT_URL, READ_ONLY_OPTION, make_engine, translated, upgrade
+
+if TYPE_CHECKING:
+    from sqlalchemy.dialects.postgresql import Insert as PostgresInsert
 
 P = ParamSpec("P")
 T = TypeVar("T")
@@ -316,4 +317,8 @@ def if_given(column: Column[Any], value: object) -> list[ColumnElement[bool]]:
 
 def dialect_insert(connection: Connection, table: Table) -> PostgresInsert | SqliteInsert:
     """An insert with ON CONFLICT clauses, whose syntax differs between databases."""
-    return postgres_insert(table) if connection.dialect.name == "postgresql" else sqlite_insert(table)
+    if connection.dialect.name != "postgresql":
+        return sqlite_insert(table)
+    from sqlalchemy.dialects.postgresql import insert as postgres_insert  # a tenth of a second for every command
+
+    return postgres_insert(table)
