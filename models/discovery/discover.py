@@ -17,7 +17,7 @@ from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.finding import doubted, finding
 from abbe.models.discovery.instrument_noise import unscaled
-from abbe.models.discovery.mixed_up import mixed_up
+from abbe.models.discovery.mixed_up import mixed_up, wrong_tool
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
 from abbe.models.discovery.solved_model import predictions, solve
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping, extra_variance, rough_place
@@ -108,7 +108,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     tell("fitting the present simulation", 0.0)
     plain = whiten(case, baseline_of(case))
     before = predictions(plain, solve(plain, ()))
-    mixed = mixed_up(plain)
+    mixed = mixed_up(plain) or wrong_tool(plain)
     if mixed is not None:
         return doubted(finding(plain, plain, (), (), solve(plain, ()), (), (before, before)), mixed)
     tell("comparing effects", 0.2)

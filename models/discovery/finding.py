@@ -17,6 +17,7 @@ from abbe.models.discovery.experiment.additions import blind_spots, judging_run
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
+from abbe.models.discovery.left_out import left_out_gap
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
 from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
@@ -263,6 +264,7 @@ def finding(
         agreement=agreement,
         unjudged=unjudged,
         unseen=blind_spots(case) if verdict == "none" else (),
+        left_out=left_out_gap(problem, solved, floor) if is_named and "holdout" not in gaps else None,
     )
 
 

@@ -1,23 +1,34 @@
 """Readings under the wrong label: whether two runs fit when their readings are exchanged, or one when its readings are reversed.
 
-This comes before any effect is blamed: exchanged readings resemble hysteresis, lags and lost motion of several axes.
+Also tools whose stated vector has the wrong sign in one component. This comes before any effect is blamed: exchanged readings resemble
+hysteresis, lags and lost motion of several axes. A wrong sign that all runs share, of the tool or of a pivot, changes no reading: the error
+motions along the axes take up what it does to the rotations.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.discovery.whitened_problem import WhitenedProblem
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten
+from abbe.models.effects.path import Path
+from abbe.models.machine import AXES
 
 REMAINS = 0.6
 """Readings are mixed up if less than this share of the misfit of the whole campaign remains with them put right ..."""
 ALONE = 0.5
 """... and no correction of other runs explains this share of what the best one explains."""
+SAME_MM = 0.5
+"""Tools that differ by less are one tool, and a shorter component has no sign."""
+EXCESS = 0.4
+"""A tool's sign is wrong if less than this share of the misfit above the noise remains with it put right ..."""
+CLEAR = 60.0
+"""... and chi-square becomes smaller by more than this."""
 
 
 @dataclass(frozen=True)
@@ -65,3 +76,50 @@ def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]
             change = np.zeros(problem.gap.size)
             change[at[i]], change[at[j]] = read[j] - read[i], read[i] - read[j]
             yield (one.label, other.label), "exchanged", change
+
+
+def wrong_tool(problem: WhitenedProblem) -> MixedUp | None:
+    """Find the tool that explains most of the misfit if one component of its vector changes sign; None if none does, or all runs have one.
+
+    Two tools that explain it equally are both named: turned round together, they and the rotations leave the same readings.
+    ``problem``: as for `mixed_up`. Every tool and component is tried by a new fit of the simulation.
+    """
+    tools = {_tool(p) for p in problem.paths}
+    noise, plain = float(problem.use @ (1.0 - problem.projection.leverage)), _misfit(problem, problem)
+    if len(tools) < 2 or plain - noise < CLEAR:
+        return None
+    tried = {(t, a): _misfit(_turned(problem, t, a), problem) for t in tools for a in range(3) if abs(t[a]) > 1}
+    if not tried:
+        return None
+    least, axis = min((left, a) for (_, a), left in tried.items())
+    alike = {t for (t, a), left in tried.items() if a == axis and left < least + CLEAR}
+    others = min((left for (t, a), left in tried.items() if t not in alike), default=plain)
+    if plain - least < CLEAR or least - noise > EXCESS * (plain - noise) or plain - others > ALONE * (plain - least):
+        return None
+    runs = tuple(p.label for p in problem.paths if _tool(p) in alike)
+    return MixedUp(
+        runs, f"taken with {'a tool' if len(alike) < 2 else 'tools'} whose tool_mm has the wrong sign in {AXES[axis]}", least / plain
+    )
+
+
+def _tool(path: Path) -> tuple[float, ...]:
+    return tuple(np.round(path.machine.tool_mm / SAME_MM).tolist())
+
+
+def _turned(problem: WhitenedProblem, tool: tuple[float, ...], axis: int) -> WhitenedProblem:
+    """The problem with one component of one tool turned round in all its runs."""
+    sign = np.where(np.arange(3) == axis, -1.0, 1.0)
+    runs = []
+    for run in problem.case.runs:
+        machine = run.path.machine
+        if _tool(run.path) == tool:
+            machine = replace(machine, tool_mm=sign * machine.tool_mm)
+        runs.append(replace(run, path=replace(run.path, machine=machine)))
+    case = replace(problem.case, runs=tuple(runs))
+    return whiten(case, baseline_of(case))
+
+
+def _misfit(problem: WhitenedProblem, scale: WhitenedProblem) -> float:
+    """Chi-square that a problem leaves, by the noise of ``scale``."""
+    left = problem.projection.residual * problem.sd_mm() / scale.sd_mm()
+    return float((scale.use * left) @ left)

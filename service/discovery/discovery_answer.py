@@ -35,6 +35,7 @@ def answer_doc(finding: Finding) -> dict[str, Any]:
     doc |= {"next_test": _next_test(test)} if test is not None else {}
     if fitted is not None:
         doc |= {"rms_before_um": fitted.before_um, "rms_after_um": fitted.after_um, "noise_floor_um": fitted.floor_um}
+    doc |= {"left_out": asdict(finding.left_out)} if finding.left_out is not None else {}
     return doc if holdout is None else doc | {"holdout_rms_um": holdout.after_um}
 
 

@@ -55,7 +55,7 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
         there = "; ".join(location_lines(finding.location)) or "it could not be located"
         return "bad", "Something is missing that the catalogue does not explain", f"{_capital(gap)}. {there}.{beside}"
     judged = judge(finding)
-    proof = _proof_text(judged) if judged.proved else judged.rule
+    proof = _proof_text(judged) if judged.proved else f"{judged.rule}{_left_out_text(finding)}"
     word = "Found" if not finding.confounded_with else "Found, but these runs cannot tell it from something else"
     left = _remainder_text(finding)
     sign = "ok" if word == "Found" and not left else "open"
@@ -97,12 +97,19 @@ def _judging_text(gap: GapUm) -> str:
     return f"from {before} to {after} µm rms where {floor} µm is noise{share}"
 
 
+def _left_out_text(finding: Finding) -> str:
+    """Tell how far the gap closed on blocks of runs that were left out in turn; empty where holdout runs judge."""
+    if finding.left_out is None:
+        return ""
+    return f"; on blocks of runs left out of the fit in turn, for names that all readings chose, {_judging_text(finding.left_out)}"
+
+
 def _suspect_text(finding: Finding) -> str:
     """List the effects that the holdout runs do not confirm; empty without any."""
     names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.suspects)
     judging = finding.gaps.get("holdout")
     figures = "" if judging is None else f" ({_judging_text(judging)})"
-    return f" Suspected: {names}; but {finding.proof}{figures}." if names else ""
+    return f" Suspected: {names}; but {finding.proof}{figures}{_left_out_text(finding)}." if names else ""
 
 
 def _repeatability_text(finding: Finding) -> str:

@@ -45,6 +45,7 @@ def finding_of(
         p_value=found.p_value,
         noise_um={kind: v * 1e3 for kind, v in found.noise_mm.items()},
         gaps={role: _gap(g) for role, g in found.gaps.items() if math.isfinite(g.before_mm + g.after_mm + g.floor_mm)},
+        left_out=None if found.left_out is None else _gap(found.left_out),
         runs={r.path.label: _run(found, r) for r in case.runs},
         effects=tuple(effect_found(e, by_name[e.name], by_name) for e in found.effects),
         location=found.location,

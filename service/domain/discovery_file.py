@@ -103,6 +103,14 @@ class FoundThinning(FileObject):
     unobservable: list[str] = Field(alias="not_seen")
 
 
+class FoundLeftOut(FileObject):
+    """Without holdout runs: rms of blocks of the fitted runs, µm, each predicted by a fit to the other blocks. All chose the names."""
+
+    before_um: float = Field(ge=0)
+    after_um: float = Field(ge=0)
+    floor_um: float = Field(ge=0)
+
+
 class DiscoveryFile(FileObject):
     """Effects that a campaign's simulation lacks, and the predictions of sealed runs, mm.
 
@@ -130,5 +138,6 @@ class DiscoveryFile(FileObject):
     rms_before_um: float | None = Field(None, ge=0)
     rms_after_um: float | None = Field(None, ge=0)
     holdout_rms_um: float | None = Field(None, ge=0)
+    left_out: FoundLeftOut | None = None
     noise_floor_um: float | None = Field(None, ge=0)
     predictions: dict[str, list[float]]

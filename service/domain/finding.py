@@ -251,6 +251,7 @@ class Finding:
     unjudged, unseen : runs that cannot be judged, and blind spots, if nothing is missing.
     fitted : parameters of the present simulation that these runs measure.
     doubt : what is probably wrong with the data of the runs of ``location``; then no effect was searched for.
+    left_out : gap of the fitted runs on blocks that are left out in turn; None if holdout runs judge.
     thinning : decimation of long runs before the search; None: they were searched as they were read.
     predictions : of sealed runs, mm.
     changed : changes since an earlier solution, if one could be compared.
@@ -262,6 +263,7 @@ class Finding:
     p_value: float = 1.0
     noise_um: Mapping[str, float] = field(default_factory=dict)
     gaps: Mapping[str, GapUm] = field(default_factory=dict)
+    left_out: GapUm | None = None
     runs: Mapping[str, RunResidual] = field(default_factory=dict)
     effects: tuple[EffectFound, ...] = ()
     suspects: tuple[EffectFound, ...] = ()

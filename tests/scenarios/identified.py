@@ -47,7 +47,7 @@ def _identify(folder: Path) -> None:
 
 async def _measure(site: Site, store: Store) -> None:
     full = identification(site.machine, rate_hz=RATE_HZ, name="june")
-    tests = [t for t in full.tests if t.label in ("helix1", "helix2", "helix3")]
+    tests = [t for t in full.tests if t.label in ("helix1", "judge-helix1", "helix2", "helix3")]
     tests += [Diagonal(f"step-{d}-XYZ", f"D{d}XYZ", "identify", d, STEPS, "XYZ").plan(site.machine) for d in DIAGONALS]
     tests += [
         Linear(f"line{AXES[a]}{k}", f"L{AXES[a]}{k}", "identify", a, at_share=(at, at), positions=POSITIONS).plan(site.machine)

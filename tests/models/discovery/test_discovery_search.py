@@ -22,6 +22,7 @@ from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, at_rest, driven
 from abbe.models.machine import Machine
 from abbe.service.discovery.discovery_answer import answer_doc
+from abbe.service.discovery.discovery_text import lines_of
 from abbe.service.discovery.finding import finding_of
 
 R, N = 100.0, 109
@@ -249,3 +250,17 @@ def test_what_is_left_of_readings_is_orthogonal_to_what_was_taken_out() -> None:
     assert space.residual == pytest.approx(left, abs=1e-8)
     assert space.chi2 == pytest.approx(float(left @ left), abs=1e-8)
     assert space.leverage.sum() == pytest.approx(7.0, abs=1e-8)
+
+
+def test_without_a_run_that_judges_the_gap_is_told_on_left_out_blocks_and_such_a_run_is_proposed() -> None:
+    case = campaign(backlash_um=4.0)
+    alone = replace(case, runs=case.of("identify"))
+    held, found = discover(case, FEW).gaps["holdout"], discover(alone, FEW)
+    assert found.left_out is not None
+    assert found.left_out.before_mm == pytest.approx(held.before_mm, rel=0.3)
+    assert found.left_out.after_mm == pytest.approx(held.after_mm, rel=0.1)
+    assert found.next_test is not None
+    assert found.next_test.adds == ("judging_run",)
+    told = lines_of(finding_of(found, alone, FEW, {r.path.label: np.zeros(r.path.n) for r in alone.runs}))
+    assert "no holdout run of this campaign can judge; on blocks of runs left out of the fit in turn" in told[0]
+    assert any("measure next: a run of the role holdout" in line for line in told)

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.case import Case
+from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.discover import discover
-from abbe.models.discovery.mixed_up import mixed_up
+from abbe.models.discovery.mixed_up import mixed_up, wrong_tool
 from abbe.models.discovery.whitened_problem import whiten
+from abbe.models.machine import Machine
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_states import after_fit
 from abbe.service.discovery.discovery_text import lines_of
@@ -52,3 +53,48 @@ def test_readings_in_the_reverse_order_are_suspected() -> None:
 @pytest.mark.parametrize("case", [campaign(), campaign(backlash_um=6.0), campaign(step_um=5.0)], ids=["nothing", "lost motion", "step"])
 def test_what_is_right_is_not_suspected(case: Case) -> None:
     assert mixed_up(whiten(case, baseline_of(case))) is None
+
+
+def with_tools(sign: float) -> Case:
+    """A machine with rotations of 60 urad, measured with three tools; the last one's X is stated with a sign.
+
+    With two tools, circles could not tell: rotations of the other sign would explain the same readings.
+    """
+    plain = replace(campaign(), includes=frozenset({"rigid21", "setup_centre_offset", "bar_length_error"}))
+    rng = np.random.default_rng(5)
+
+    def stated(runs: tuple[CaseRun, ...], sign: float) -> Case:
+        tools = np.array([(0.0, 0.0, -120.0), (30.0, 0.0, -120.0), (60.0 * sign, 0.0, -120.0)])
+        machines = [replace(r.path.machine, tool_mm=tools[k % 3]) for k, r in enumerate(runs)]
+        return replace(plain, runs=tuple(replace(r, path=replace(r.path, machine=m)) for r, m in zip(runs, machines, strict=True)))
+
+    true = stated(plain.runs, 1.0)
+    base = baseline_of(true)
+    theta = np.array([60e-6 * rng.normal() if t.component >= 3 and 0 < t.order < 6 else 0.0 for t in base.terms])
+    theta = np.concatenate([theta, np.zeros(base.size - theta.size)])
+    read = [base.read(r.data(), theta) + 2e-4 * rng.normal(size=r.path.n) for r in true.runs]
+    measured = (replace(r, deviation_mm=None if r.role == "sealed" else y) for r, y in zip(plain.runs, read, strict=True))
+    return stated(tuple(measured), sign)
+
+
+def test_the_wrong_sign_of_a_tool_is_suspected_by_component_and_runs() -> None:
+    case = with_tools(-1.0)
+    found = wrong_tool(whiten(case, baseline_of(case)))
+    assert found is not None
+    assert found.how == "taken with tools whose tool_mm has the wrong sign in X"
+    assert found.runs == tuple(r.path.label for r in case.of("identify") if r.path.machine.tool_mm[0])  # 30 and -60, or -30 and 60
+    right = with_tools(1.0)
+    assert wrong_tool(whiten(right, baseline_of(right))) is None
+
+
+def test_a_wrong_sign_that_all_runs_share_changes_no_residual() -> None:
+    """Of the only tool, or of a pivot: nothing in these readings tells it, and no effect is blamed for it."""
+    plain = replace(campaign(), includes=frozenset({"rigid21", "setup_centre_offset", "bar_length_error"}))
+
+    def left(machine: Machine) -> float:
+        case = replace(plain, machine=machine, runs=tuple(replace(r, path=replace(r.path, machine=machine)) for r in plain.runs))
+        return whiten(case, baseline_of(case)).projection.chi2
+
+    machine = replace(plain.machine, tool_mm=np.array([40.0, 0.0, -120.0]))
+    other = replace(machine, tool_mm=np.array([-40.0, 0.0, -120.0]), pivots_mm=machine.pivots_mm * (1.0, 1.0, -1.0))
+    assert left(other) == pytest.approx(left(machine), rel=0.01)
