@@ -8,7 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
+from abbe.service.domain.document import record
 from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.measured import CampaignHead
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.errors import CampaignRefused
@@ -34,6 +36,11 @@ class Campaign:
     doc: dict[str, Any] = field(default_factory=dict)
     removed: TableRemoval | None = None
     tables: Mapping[int, bytes] = field(default_factory=dict, repr=False)
+
+    @property
+    def head(self) -> CampaignHead:
+        """What was known when it began. Raises Unusable if a field has another type."""
+        return record(CampaignHead, self.doc, f"campaign {self.name}")
 
     def without(self, labels: list[str]) -> Campaign:
         """Return the campaign without the named runs.
@@ -64,7 +71,7 @@ def from_folder(folder: Path) -> Campaign:
         A file has a mistake; the first one is reported.
     """
     content = read_folder(folder)
-    return replace(_campaign(content.campaign["campaign"], content.campaign, content.runs, folder), tables=content.tables)
+    return replace(_campaign(content.name, content.campaign, content.runs, folder), tables=content.tables)
 
 
 def from_store(store: Store, name: str) -> Campaign:

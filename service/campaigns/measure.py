@@ -29,15 +29,16 @@ from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session, notes_since
-from abbe.service.domain.measured import DISK_FULL, this_process
+from abbe.service.domain.measured import DISK_FULL, RunStart, this_process
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
+from abbe.service.domain.run import RunTable
 from abbe.service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.paths import warnings_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
-from abbe.service.sequences.resume_plan import Attempt
+from abbe.service.sequences.resume_plan import Attempt, PathRemainder
 from abbe.service.sequences.runner import Runner, Tick
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
 from abbe.service.sequences.waiting import ExpectedTable
@@ -148,7 +149,7 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
     table = await _table_in_force(session)
     doc = {
         "ctrl0_us": status.ctrl_us,
-        **({} if table is None else {"active_bank": table["bank"], "table_crc": table["crc"], "boot_id": table["boot_id"]}),
+        **({} if table is None else {"active_bank": table.bank, "table_crc": table.crc, "boot_id": table.boot_id}),
         "current_model": {"includes": ["rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"], "errors": None},
         "instruments": {"ballbar": {"resolution_mm": 1e-6}, "laser": {"resolution_mm": laser_mm}},
         "temperature_sensors": False,
@@ -162,12 +163,13 @@ def artefacts_of(plan: CampaignPlan) -> dict[str, Any]:
     return {"artefacts": known} if known else {}
 
 
-async def _table_in_force(session: Session) -> dict[str, int] | None:
-    """Return the compensation table in force as in a run's document; None for a control that shows none."""
+async def _table_in_force(session: Session) -> RunTable | None:
+    """Return the compensation table in force; None for a control that shows none."""
     if only_listens(session.controller):
         return None
     comp = await session.controller.comp_status()
-    return {"bank": comp.active_bank, "crc": comp.bank_crc[comp.active_bank], "gen": comp.gen, "boot_id": comp.boot_id}
+    crc = comp.bank_crc[comp.active_bank]
+    return RunTable.from_document({"bank": comp.active_bank, "crc": crc, "gen": comp.gen, "boot_id": comp.boot_id})
 
 
 @dataclass(frozen=True, slots=True)
@@ -262,9 +264,14 @@ async def _campaign_run(
     if options.resumed is not None and options.resumed.expected is not None:
         expected = options.resumed.expected  # the table may have changed since the check, while a question was open
     source = {} if options.source is None else asdict(options.source)
-    begun = {"plan": plan_hash(plan), "source": source, "boot_id": expected.boot_id, "table_crc": expected.table_crc}
-    begun["owner"] = asdict(this_process())
-    await journal.add(BEGUN, **begun)
+    await journal.add(
+        BEGUN,
+        plan=plan_hash(plan),
+        source=source,
+        boot_id=expected.boot_id,
+        table_crc=expected.table_crc,
+        owner=asdict(this_process()),
+    )
     campaign_run = CampaignRun(session, control, site.watching, journal, expected, options.confirm)
     campaign_run.read_path = lambda test, mounting: read_path(session, store, journal.campaign, test, mounting)
     if options.resumed is not None:
@@ -350,9 +357,7 @@ async def measure_test(  # noqa: PLR0913 - a test, its devices, its destination,
     """Measure one test as one run; if it ends early, store the reason in the run before raising the error."""
     context = context or AttemptContext(Runner(session), Attempt(), NoJournal())
     runner, attempt, journal = context.runner, context.attempt, context.journal
-    doc = await start_document(session, site, campaign, test, clock) | _standstills(test, attempt)
-    if attempt.remainder is not None:
-        doc["path"] |= attempt.remainder.doc()
+    doc = await start_document(session, site, campaign, test, clock, attempt.remainder) | _standstills(test, attempt)
     run_id = await store.write(store.runs.start, campaign.id, test.label, test.test, test.role, doc)
     status, reason, end = "aborted", "stopped", dict[str, Any]()
     recorder: CaptureRecorder | None = None
@@ -380,8 +385,10 @@ async def measure_test(  # noqa: PLR0913 - a test, its devices, its destination,
     finally:
         mounted_us = end.get("mounted_us", runner.mounted_us)
         if mounted_us is not None:
-            campaign.mounted_us[test.setup_id] = end["mounted_us"] = mounted_us
-        end |= {"ended_utc": clock.utc().isoformat(), "clock_pairs": notes_since(session.controller, doc["clock"]["ctrl_us"])}
+            campaign.mounted_us[test.setup_id] = mounted_us
+            end |= {"mounted_us": mounted_us}
+        begun_us = RunStart.from_document(doc).clock_us
+        end |= {"ended_utc": clock.utc().isoformat(), "clock_pairs": notes_since(session.controller, begun_us or 0)}
         end |= {} if recorder is None else recorder.doc()
         end |= {} if runner.way is None or status == "complete" else runner.way.doc()
         await run_to_end(close_run(store, run_id, recorder, status, reason, end))
@@ -403,7 +410,9 @@ def live_view(live: LiveFeed | None, test: TestPlan, recorder: CaptureRecorder) 
         live.end()
 
 
-async def start_document(session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock) -> dict[str, Any]:
+async def start_document(
+    session: Session, site: Site, campaign: OpenCampaign, test: TestPlan, clock: Clock, remainder: PathRemainder | None = None
+) -> dict[str, Any]:
     """Return the start document of a run. Its mounting time is preliminary for a test that mounts; the end document has `mounted_us`."""
     status = await session.controller.status()
     table = await _table_in_force(session)
@@ -414,16 +423,16 @@ async def start_document(session: Session, site: Site, campaign: OpenCampaign, t
         "setup": test.setup.mounted((set_us - ctrl0_us) * 1e-6).document,
         "machine": site.doc,
         "ctrl0_us": ctrl0_us,
-        **({} if table is None else {"table": table | {"acting": status.compensation_on}}),
+        **({} if table is None else {"table": table.document | {"acting": status.compensation_on}}),
         "clock": {"utc": clock.utc().isoformat(), "host_s": clock.monotonic_s(), "ctrl_us": status.ctrl_us},
         "versions": {"abbe": version("abbe"), "python": platform.python_version()},
     }
-    for step in test.steps:
-        if isinstance(step, RecordPath):
-            doc["path"] = {"feed_mm_min": step.feed_mm_min, "direction": step.direction, "points_mm": [list(p) for p in step.points_mm]}
-            doc["path"] |= {} if step.measured is None else {"measured": list(step.measured)}
-            doc["rate_hz"] = step.rate_hz
-    return doc
+    step = next((step for step in test.steps if isinstance(step, RecordPath)), None)
+    if step is None:
+        return doc
+    path = {"feed_mm_min": step.feed_mm_min, "direction": step.direction, "points_mm": [list(p) for p in step.points_mm]}
+    path |= {} if step.measured is None else {"measured": list(step.measured)}
+    return doc | {"path": path | ({} if remainder is None else remainder.doc()), "rate_hz": step.rate_hz}
 
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:

@@ -101,10 +101,8 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     found = _Finder(store, campaign.id, plan, lines, {run.id: run.visible_status for run in store.runs.all(campaign.id)})
     start = await found.starts(session, confirm, messages)
     messages.insert(1, f"{len(found.done)} of {len(plan.tests)} tests are complete")
-    ctrl0_us = int(campaign.doc["ctrl0_us"])
-    return Resumed(
-        (campaign.id, ctrl0_us), found.done, start, found.mountings, frozenset(found.used), found.mounted_us, tuple(messages), expected
-    )
+    begun = (campaign.id, campaign.head.zero_us)
+    return Resumed(begun, found.done, start, found.mountings, frozenset(found.used), found.mounted_us, tuple(messages), expected)
 
 
 def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, site: Site, plan: CampaignPlan) -> None:

@@ -129,14 +129,14 @@ async def measure_added(
     if what.remaining is None:
         return 0.0
     status, comp = await session.controller.status(), await session.controller.comp_status()
-    old = campaign.doc
-    if "ctrl0_us" not in old or old.get("boot_id") != comp.boot_id or old["ctrl0_us"] > status.ctrl_us:
+    old = campaign.head
+    if old.ctrl0_us is None or old.boot_id != comp.boot_id or old.ctrl0_us > status.ctrl_us:
         raise CampaignRefused(f"campaign {campaign.name} was measured before the controller restarted, or elsewhere", NO_CLOCK)
     now = comp.bank_crc[comp.active_bank]
     tables = {run.table.crc for run in campaign.runs} - {None, now}
     if tables:
         raise CampaignRefused(f"campaign {campaign.name} was measured with another compensation table", "measure it again")
-    wait_s: float = what.after_s - (1e-6 * (status.ctrl_us - old["ctrl0_us"]) - _last_s(campaign))
+    wait_s: float = what.after_s - (1e-6 * (status.ctrl_us - old.ctrl0_us) - _last_s(campaign))
     if what.after_s > 0.0 and wait_s > 0.0:
         return wait_s
     if status.moving:  # the operator must not reach into a moving machine
@@ -147,7 +147,7 @@ async def measure_added(
     if what.begun is None:
         begun = await start_campaign(session, store, site, what.plan.name, {"continues": what.link})
     else:
-        begun = (what.begun.id, int(what.begun.doc["ctrl0_us"]))
+        begun = (what.begun.id, what.begun.head.zero_us)
     await measure(session, store, site, what.remaining, progress=progress, campaign=begun)
     return 0.0
 
@@ -173,7 +173,7 @@ def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: s
 
 def joined(old: Campaign, new: Campaign) -> Campaign:
     """Join the runs of both campaigns on the old campaign's clock, under the new campaign's name."""
-    later_s = (new.doc["ctrl0_us"] - old.doc["ctrl0_us"]) * 1e-6
+    later_s = (new.head.zero_us - old.head.zero_us) * 1e-6
     runs = [*old.runs, *(_later(run, later_s) for run in new.runs)]
     doc = old.doc | {"campaign": new.name}
     return replace(new, runs=runs, doc=doc)

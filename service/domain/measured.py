@@ -16,7 +16,7 @@ from typing import Any, Self, TypeVar
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.service.domain.document import Doc, DocumentRow, HistoryRow
+from abbe.service.domain.document import Doc, DocumentRow, HistoryRow, record
 from abbe.service.domain.run import RunTable
 from abbe.service.errors import StoreError
 
@@ -274,11 +274,37 @@ class MachineRecord(DocumentRow):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignHead:
+    """What is known when a campaign begins.
+
+    ``ctrl0_us``: zero of its clock in controller time of the start ``boot_id``; None for an imported campaign, whose documents are
+    ``imported`` and ``errors``.
+    """
+
+    ctrl0_us: int | None = None
+    boot_id: int | None = None
+    imported: Doc | None = None
+    errors: Doc | None = None
+
+    @property
+    def zero_us(self) -> int:
+        """Zero of the clock of a campaign that was measured here. Raises StoreError for another."""
+        if self.ctrl0_us is None:
+            raise StoreError("the campaign has no clock of the controller", "only a campaign that Abbe measured can be continued")
+        return self.ctrl0_us
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignRecord(DocumentRow):
     """Runs that belong together: one machine, one clock zero."""
 
     machine_id: int
     name: str
+
+    @property
+    def head(self) -> CampaignHead:
+        """The document, parsed. Raises Unusable if a field has another type."""
+        return record(CampaignHead, self.doc, f"campaign {self.name}")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -12,8 +12,8 @@ from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.domain.document import Doc
 from abbe.service.domain.imported_file import SourceFile
-from abbe.service.domain.run import PLACES, Run
-from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT, CampaignFile
+from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.answers import LENGTHS, Answers, laser_of, settled, unknown_of
 from abbe.service.instrument_files.content import AxisReadings, Content, Trace
@@ -63,29 +63,39 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     measured = [(test.axis, test.position_mm) for test in tests if test is not None]
     measured += [(axis, columns[f"{axis.lower()}_mm"]) for columns, axis in traces]
     made = machine or _assumed_machine(contents, measured)
-    runs, entries, setups, start = list[Doc](), list[Doc](), dict[str, Doc](), 0.0
+    runs, start = list[Run](), 0.0
     for columns, axis in [*((_columns(test), test.axis) for test in linear), *traces]:
         run = _run(name, len(runs) + 1, made, axis, {k: v + start if k == "t_s" else v for k, v in columns.items()})
-        start = run["columns"]["t_s"][-1] + PAUSE_S
+        start = float(run.columns.t_s[-1]) + PAUSE_S
         runs.append(run)
-        entries.append({key: run[key] for key in ("run_id", "test", "role")} | {"file": f"{run['run_id']}.json"})
-        setups[run["setup"]["setup_id"]] = {"kind": "laser", "t_set_s": run["setup"]["t_set_s"]}
     origins = [_origin(*one, machine) for one in zip(contents, tests, strict=True)]
+    instruments = {"laser": laser_of(linear)} if linear else {}
+    further = {"origins": [one.model_dump() for one in origins]} | _beside(contents, tests)
+    return Made(checked_campaign(name, made, runs, {"instruments": instruments} | further), tuple(origins))
+
+
+def checked_campaign(name: str, machine: Doc, runs: Sequence[Run], further: Doc) -> FolderContent:
+    """Make a campaign of runs that come from files, and check it like a folder; ``further``: the other keys of its document.
+
+    Raises
+    ------
+    FileFormatError
+        A run or the campaign violates its format.
+    """
     document = {
         "format": CAMPAIGN_FORMAT,
         "campaign": name,
-        "machine": made,
+        "machine": machine,
         "current_model": {"includes": list(ASSUMED_MODEL), "errors": None},
-        "instruments": {"laser": laser_of(linear)} if linear else {},
-        "setups": setups,
-        "temperature_sensors": any(key.startswith("temp_") for run in runs for key in run["columns"]),
-        "runs": entries,
-        "origins": [one.model_dump() for one in origins],
-    } | _beside(contents, tests)
-    for run in runs:
-        check_run(Path(f"{run['run_id']}.json"), run)
+        "setups": {run.setup.setup_id: {"kind": run.instrument, "t_set_s": run.setup.t_set_s} for run in runs},
+        "temperature_sensors": any(run.columns.temperatures_c for run in runs),
+        "runs": [{"run_id": run.run_id, "test": run.test, "role": run.role, "file": f"{run.run_id}.json"} for run in runs],
+    } | further
+    files = [run.to_document() for run in runs]
+    for run, file in zip(runs, files, strict=True):
+        check_run(Path(f"{run.run_id}.json"), file)
     check(Path("campaign.json"), document, CampaignFile)
-    return Made(FolderContent(document, runs, [Run.from_document(run) for run in runs], None, {}), tuple(origins))
+    return FolderContent(document, files, [run.with_artefact(document) for run in runs], None, {})
 
 
 def _check_together(contents: Sequence[Content]) -> None:
@@ -144,20 +154,21 @@ def _standing(trace: Trace, answers: Answers) -> tuple[dict[str, F1], str]:
     return {"t_s": t, **places, "feed_mm_min": zero, "direction": zero + 1.0, "deviation_mm": mean - mean[0]}, axis
 
 
-def _run(campaign: str, number: int, machine: Doc, axis: str, columns: Mapping[str, F1]) -> Doc:
-    """A run document. Start is the lowest target and end the highest, so that deviations count along + of the axis."""
-    unit, at = np.eye(3)[AXES.index(axis)], columns[f"{axis.lower()}_mm"]
+def _run(campaign: str, number: int, machine: Doc, axis: str, columns: Mapping[str, F1]) -> Run:
+    """A run. Start is the lowest target and end the highest, so that deviations count along + of the axis."""
+    unit, at, parsed = np.eye(3)[AXES.index(axis)], columns[f"{axis.lower()}_mm"], Columns.from_document(dict(columns))
     setup = {
         "setup_id": f"L{number}",
-        "t_set_s": float(columns["t_s"][0]),
+        "t_set_s": float(parsed.t_s[0]),
         "axis": axis,
         "start_mm": (unit * at.min()).tolist(),
         "end_mm": (unit * at.max()).tolist(),
         "nominal_beam": unit.tolist(),
     }
-    plain = {key: values.tolist() for key, values in columns.items()} | {"direction": columns["direction"].astype(int).tolist()}
-    head = {"format": RUN_FORMAT, "campaign": campaign, "run_id": f"r{number:02d}", "test": "laser_linear", "role": "identify"}
-    return head | {"machine": machine, "setup": setup, "columns": plain}
+    return Run(
+        campaign=campaign, run_id=f"r{number:02d}", test="laser_linear", role="identify", machine=machine,
+        setup=parsed_setup("laser_linear", setup), columns=parsed,
+    )  # fmt: skip
 
 
 def _origin(content: Content, test: AxisReadings | None, machine: Doc | None) -> SourceFile:

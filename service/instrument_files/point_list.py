@@ -9,23 +9,20 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import scipy
 
 from abbe.models.arrays import F2
-from abbe.service.domain.artefact import ARTEFACT_TEST
+from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE
 from abbe.service.domain.document import Doc
-from abbe.service.domain.run import PLACES, Run
-from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, RUN_FORMAT, CampaignFile
+from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
 from abbe.service.errors import FileFormatError
 from abbe.service.formats.files import TextFile
-from abbe.service.instrument_files.campaign import ASSUMED_CHAIN
+from abbe.service.instrument_files.campaign import ASSUMED_CHAIN, checked_campaign
 from abbe.service.instrument_files.content import read_bytes, text_file
-from abbe.service.runs.checks import check, check_run
 from abbe.service.runs.exchange import FolderContent
 
 HEAD = (
@@ -59,6 +56,20 @@ class PointList:
     columns: Mapping[str, list[str]]
     lengths: list[str] = field(default_factory=list)
 
+    @property
+    def features(self) -> list[str]:
+        """Names of the features, in order."""
+        return self.columns["feature"]
+
+    @property
+    def artefact(self) -> str:
+        """Name of the artefact."""
+        return self.head.get("artefact", "A")
+
+    def number(self, key: str, usual: str) -> float:
+        """A number of the head."""
+        return float(self.head.get(key, usual))
+
 
 def is_point_list(path: Path) -> bool:
     """Whether a file is a list of an artefact's points, by its first lines."""
@@ -79,29 +90,18 @@ def campaign_of_points(paths: Sequence[Path], name: str, machine: Doc | None) ->
         A file has a mistake; the message has file and line.
     """
     lists = [_read(text_file(path.name, read_bytes(path))) for path in paths]
-    artefacts, runs, start = dict[str, Doc](), list[Doc](), 0.0
-    for number, one in enumerate(lists, start=1):
-        columns = _columns(one, start)
-        start = columns["t_s"][-1] + 10.0 * POINT_S
-        runs.append(_run(one, name, f"p{number}", columns))
-        found, known = _artefact(one), artefacts.get(runs[-1]["setup"]["artefact"])
-        features = {f["id"]: f for f in [*(known["features"] if known else []), *found["features"]]}
-        lengths = [*(known["calibrated_lengths"] if known else []), *found["calibrated_lengths"]]
-        artefacts[runs[-1]["setup"]["artefact"]] = found | {"features": list(features.values()), "calibrated_lengths": lengths}
-    made = machine or _assumed(runs)
-    runs = [run | {"machine": made} for run in runs]
+    artefacts, all_columns, start = dict[str, KnownArtefact](), list[Columns](), 0.0
+    for one in lists:
+        all_columns.append(_columns(one, start))
+        start = float(all_columns[-1].t_s[-1]) + 10.0 * POINT_S
+        found = _artefact(one)
+        artefacts[one.artefact] = found.beside(artefacts[one.artefact]) if one.artefact in artefacts else found
+    made = machine or _assumed(all_columns)
+    runs = [_run(one, name, f"p{k}", made, columns) for k, (one, columns) in enumerate(zip(lists, all_columns, strict=True), start=1)]
     cmm = {key: float(one.head[key]) for one in lists for key in ("U_mm", "U_per_m_mm") if key in one.head}
-    document = {
-        "format": CAMPAIGN_FORMAT, "campaign": name, "machine": made, "current_model": {"includes": list(ASSUMED_MODEL), "errors": None},
-        "instruments": {"cmm": cmm | {"k": 2}} if cmm else {"probe": {}},
-        "setups": {r["run_id"]: {"kind": "artefact", "t_set_s": r["setup"]["t_set_s"]} for r in runs},
-        "temperature_sensors": False, "artefacts": artefacts,
-        "runs": [{key: r[key] for key in ("run_id", "test", "role")} | {"file": f"{r['run_id']}.json"} for r in runs],
-    }  # fmt: skip
-    for run in runs:
-        check_run(Path(f"{run['run_id']}.json"), run)
-    check(Path("campaign.json"), document, CampaignFile)
-    return FolderContent(document, runs, [Run.from_document(run).with_artefact(document) for run in runs], None, {})
+    instruments = {"cmm": cmm | {"k": 2}} if cmm else {"probe": {}}
+    known = {label: artefact.to_document() for label, artefact in artefacts.items()}
+    return checked_campaign(name, made, runs, {"instruments": instruments, "artefacts": known})
 
 
 def _read(file: TextFile) -> PointList:
@@ -170,10 +170,10 @@ def _matrix(one: PointList) -> F2:
     return np.round(matrix, 12) + 0.0
 
 
-def _columns(one: PointList, start_s: float) -> dict[str, Any]:
+def _columns(one: PointList, start_s: float) -> Columns:
     """Columns of the run; a missing one is computed or assumed."""
-    n = len(one.columns["feature"])
-    out: dict[str, Any] = {"t_s": [start_s + POINT_S * (i + 1) for i in range(n)]}
+    n = len(one.features)
+    out: Doc = {"t_s": [start_s + POINT_S * (i + 1) for i in range(n)]}
     for key, words in one.columns.items():
         if key not in NOMINAL:
             out[key] = words if key == "feature" else [float(word) if word else None for word in words]
@@ -183,31 +183,49 @@ def _columns(one: PointList, start_s: float) -> dict[str, Any]:
         deviation = (found - _vector(one, "origin_mm", "0 0 0")) @ _matrix(one) - nominal
         out |= {key: np.round(deviation[:, k], 7).tolist() for k, key in enumerate(FOUND)}
     out |= {key: [None] * n for key in FOUND if key not in out}
-    out.setdefault("u_mm", [float(one.head.get("u_mm", "0.001"))] * n)
-    if "temperature_C" in one.head:
-        out.setdefault("temperature_C", [float(one.head["temperature_C"])] * n)
-    return out
+    assumed: Doc = {"u_mm": [one.number("u_mm", "0.001")] * n}
+    assumed |= {"temperature_C": [one.number("temperature_C", "")] * n} if "temperature_C" in one.head else {}
+    return Columns.from_document(out | {key: values for key, values in assumed.items() if key not in out})
 
 
 def _nominal(one: PointList) -> F2:
-    zero = ["0"] * len(one.columns["feature"])
+    zero = ["0"] * len(one.features)
     return np.array([[float(v) for v in one.columns.get(key, zero)] for key in NOMINAL]).T
 
 
-def _run(one: PointList, campaign: str, label: str, columns: dict[str, Any]) -> Doc:
+def _run(one: PointList, campaign: str, label: str, machine: Doc, columns: Columns) -> Run:
     pose = {"origin_mm": _vector(one, "origin_mm", "0 0 0"), "matrix": _matrix(one).tolist()}
     setup = {
-        "setup_id": label, "t_set_s": columns["t_s"][0], "artefact": one.head.get("artefact", "A"),
-        "source": one.head.get("source", "machine-probe"), "tool_mm": _vector(one, "tool_mm", "0 0 0"), "pose": pose,
+        "setup_id": label, "t_set_s": float(columns.t_s[0]), "artefact": one.artefact,
+        "source": one.head.get("source", MACHINE_PROBE), "tool_mm": _vector(one, "tool_mm", "0 0 0"), "pose": pose,
     }  # fmt: skip
-    return {"format": RUN_FORMAT, "campaign": campaign, "run_id": label, "test": ARTEFACT_TEST, "role": "identify"} | {
-        "machine": {}, "setup": setup, "columns": columns,
-    }  # fmt: skip
+    return Run(
+        campaign=campaign, run_id=label, test=ARTEFACT_TEST, role="identify", machine=machine,
+        setup=parsed_setup(ARTEFACT_TEST, setup), columns=columns,
+    )  # fmt: skip
 
 
-def _artefact(one: PointList) -> Doc:
+@dataclass(frozen=True)
+class KnownArtefact:
+    """What the files say of one artefact; ``features``: by name."""
+
+    kind: str
+    features: Mapping[str, Doc]
+    lengths: Sequence[Doc]
+    numbers: Mapping[str, float]
+
+    def beside(self, earlier: KnownArtefact) -> KnownArtefact:
+        """This and what earlier files say of the same artefact."""
+        return replace(self, features={**earlier.features, **self.features}, lengths=[*earlier.lengths, *self.lengths])
+
+    def to_document(self) -> Doc:
+        """The artefact in the campaign's document."""
+        return {"kind": self.kind, "features": list(self.features.values()), "calibrated_lengths": list(self.lengths), **self.numbers}
+
+
+def _artefact(one: PointList) -> KnownArtefact:
     sensed = "".join(a for a in "xyz" if any(one.columns.get(f"deviation_{a}_mm", [])) or not any(k in one.columns for k in FOUND))
-    places = dict(zip(one.columns["feature"], _nominal(one).tolist(), strict=True))
+    places = dict(zip(one.features, _nominal(one).tolist(), strict=True))
     lengths = []
     for text in one.lengths:
         words = text.replace(",", " ").split()
@@ -215,13 +233,12 @@ def _artefact(one: PointList) -> Doc:
             raise FileFormatError(f"{one.name}: calibrated_length: expected 'from to mm U_mm', got {text!r}", "correct the line")
         lengths.append({"from": words[0], "to": words[1], "length_mm": float(words[2]), "U_mm": float(words[3]), "k": 2})
     numbers = {key: float(one.head[key]) for key in ("expansion_per_K", "u_expansion_per_K") if key in one.head}
-    features = [{"id": name, "nominal_mm": place, "sensed": sensed} for name, place in places.items()]
-    return {"kind": one.head.get("kind", "plate"), "features": features, "calibrated_lengths": lengths} | numbers
+    features = {name: {"id": name, "nominal_mm": place, "sensed": sensed} for name, place in places.items()}
+    return KnownArtefact(one.head.get("kind", "plate"), features, lengths, numbers)
 
 
-def _assumed(runs: Sequence[Doc]) -> Doc:
-    stroke = {}
-    for axis, key in zip("XYZ", PLACES, strict=True):
-        places = [v for run in runs for v in run["columns"][key]]
-        stroke[axis] = [min(places) - 1.0, max(places) + 1.0]
+def _assumed(columns: Sequence[Columns]) -> Doc:
+    places = np.concatenate([one.q_mm for one in columns])
+    ends = zip("XYZ", (places.min(axis=0) - 1.0).tolist(), (places.max(axis=0) + 1.0).tolist(), strict=True)
+    stroke = {axis: [low, high] for axis, low, high in ends}
     return {"name": "unknown machine", "chain": ASSUMED_CHAIN, "vertical_axis": "Z", "stroke_mm": stroke}

@@ -14,7 +14,7 @@ from pathlib import Path
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import CampaignRecord, ImportedRun, RunRecord
 from abbe.service.domain.run import Run
-from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile, RunEntry
 from abbe.service.errors import FileFormatError, StoreError
 from abbe.service.runs.checks import check, check_run, read_json
 from abbe.service.runs.columns import JSON_CODEC, encode_json, pack_columns, run_document, single_run, whole_run
@@ -49,6 +49,28 @@ class FolderContent:
     runs: list[Run]
     errors: Doc | None
     tables: dict[int, bytes]
+
+    @property
+    def name(self) -> str:
+        """Name of the campaign."""
+        return str(self.campaign["campaign"])
+
+    @property
+    def machine(self) -> Doc:
+        """The machine object."""
+        machine: Doc = self.campaign["machine"]
+        return machine
+
+    @property
+    def machine_name(self) -> str:
+        """Name of the machine, or of the campaign."""
+        return self.machine.get("name") or self.name
+
+    @property
+    def entries(self) -> list[Doc]:
+        """The entries of the runs (`RunEntry`), as they stand in the file."""
+        entries: list[Doc] = self.campaign["runs"]
+        return entries
 
 
 def read_folder(folder: Path) -> FolderContent:
@@ -136,11 +158,9 @@ def store_folder(store: Store, content: FolderContent) -> int:
     StoreError
         The store already has a campaign of this name.
     """
-    campaign, machine = content.campaign, content.campaign["machine"]
-    imported = [_imported(*one) for one in zip(campaign["runs"], content.run_files, content.runs, strict=True)]
-    doc = {"imported": campaign, "errors": content.errors}
-    named = machine.get("name") or campaign["campaign"]
-    return store.runs.import_campaign((named, machine), (campaign["campaign"], doc), imported, content.tables)
+    imported = [_imported(*one) for one in zip(content.entries, content.run_files, content.runs, strict=True)]
+    doc = {"imported": content.campaign, "errors": content.errors}
+    return store.runs.import_campaign((content.machine_name, content.machine), (content.name, doc), imported, content.tables)
 
 
 def export_folder(store: Store, name_or_id: str | int, target: Path, images: Images = no_image, *, csv: bool = False) -> Path:
@@ -194,10 +214,10 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
                 f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe, or is damaged: restore a backup"
             )
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
-        document = run_document(read, run, chunks)
-        _write_json(folder / entry["file"], document)
+        document, path = run_document(read, run, chunks), folder / RunEntry.read(entry).file
+        _write_json(path, document)
         if csv:
-            _write_csv((folder / entry["file"]).with_suffix(".csv"), document["columns"])
+            _write_csv(path.with_suffix(".csv"), read.columns.to_document())
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
     for crc in _acting(written):
         if (image := images(crc)) is not None:
@@ -205,17 +225,15 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
                 file.write(image)
                 file.flush()
                 os.fsync(file.fileno())
-    if record.doc.get("errors") is not None:
-        _write_json(folder / record.doc["imported"]["current_model"]["errors"], record.doc["errors"])
+    if record.head.errors is not None and record.head.imported is not None:
+        _write_json(folder / str(CampaignFile.read(record.head.imported).current_model.errors), record.head.errors)
 
 
 def _campaign_document(store: Store, record: CampaignRecord, entries: list[Doc], setups: dict[str, Doc]) -> Doc:
-    imported = record.doc.get("imported")
+    imported = record.head.imported
     if imported is not None:
-        return dict(imported) | {
-            "runs": entries,
-            "setups": setups | imported["setups"] if set(setups) - set(imported["setups"]) else imported["setups"],
-        }
+        known: Doc = imported["setups"]
+        return imported | {"runs": entries, "setups": known | {name: setup for name, setup in setups.items() if name not in known}}
     base = {"format": CAMPAIGN_FORMAT, "campaign": record.name, "machine": store.machines.get(record.machine_id).doc}
     assumed = {"current_model": {"includes": list(ASSUMED_MODEL), "errors": None}, "instruments": {}, "temperature_sensors": False}
     return base | assumed | record.doc | {"setups": setups, "runs": entries}

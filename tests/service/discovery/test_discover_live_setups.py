@@ -22,7 +22,7 @@ from tests.run_documents import run_of
 from tests.service.discovery.discovery_bench import MACHINE, Doc, write_case
 
 LIKE = Helix("a", "A", "identify", (300.0, 250.0, 100.0), 150.0, turns=4).plan(machine_from_doc(MACHINE))
-RUN: Doc = {"run_id": "r07", "test": LIKE.test, "setup": LIKE.setup, "columns": {"feed_mm_min": [1500.0], "direction": [1]}}
+RUN: Doc = {"run_id": "r07", "test": LIKE.test, "setup": LIKE.setup.document, "columns": {"feed_mm_min": [1500.0], "direction": [1]}}
 LABELS = ["n1-late1", "n1-late2", "n1-late3"]
 
 

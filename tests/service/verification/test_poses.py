@@ -65,7 +65,10 @@ def test_a_pose_that_the_solution_used_proves_nothing(solved_and_last):
     solved, last = solved_and_last
     used = next(r for r in solved.joint.data if r.points is not None and r.points.source == "probe")
     there = replace(
-        last, run_id="again", setup=replace(last.setup, matrix=used.points.matrix), columns=replace(last.columns, q_mm=used.axes_mm[:25])
+        last,
+        run_id="again",
+        setup=replace(last.setup, pose=replace(last.setup.pose, matrix=used.points.matrix)),
+        columns=replace(last.columns, q_mm=used.axes_mm[:25]),
     )
     with pytest.raises(MeasurementFault, match="a pose that the solution has used"):
         pose_figures([there], solved.joint)
