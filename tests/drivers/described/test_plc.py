@@ -1,15 +1,13 @@
-"""A PLC with three positions, made with the server of another library: a copy of the shipped file describes it; it is never commanded."""
+"""A PLC with three positions, by a library that no other part knows: a copy of the shipped file describes it; it is never commanded."""
 
 from __future__ import annotations
 
-import asyncio
 import struct
-from collections.abc import AsyncIterator, Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 
 import pytest
-from pymodbus.server import ModbusTcpServer
-from pymodbus.simulator import DataType, SimData, SimDevice
+from pyModbusTCP.server import DataBank, ModbusServer
 
 from abbe.drivers.api import Condition, only_listens
 from abbe.drivers.conformance.checks import Move
@@ -43,38 +41,44 @@ cnc = "{url}"
 """
 
 
-class Plc:
+class Plc(DataBank):
     """Positions in um and flags, little-endian to the last byte (DCBA); it asks nobody and is asked."""
 
     def __init__(self) -> None:
+        super().__init__()
         self.at_um = [1000, 2000, 3000]
         self.flags = 0
         self.cycles = 0
         self.stuck = False
         self.written = 0
 
-    async def renew(self, function: int, start: int, address: int, count: int, registers: list[int], values: object) -> None:
+    def get_holding_registers(self, address: int, number: int = 1, srv_info: object = None) -> list[int]:
         self.cycles += not self.stuck
-        self.written += function not in (3, 4)
         data = struct.pack("<I6x", 0x41424245) + bytes(10) + struct.pack("<3iHH", *self.at_um, self.cycles & 0xFFFF, self.flags)
-        registers[: len(data) // 2] = struct.unpack(f">{len(data) // 2}H", data)
+        registers = [*struct.unpack(f">{len(data) // 2}H", data), *[0] * 30]
+        return registers[address : address + number]
+
+    get_input_registers = get_holding_registers
+
+    def on_holding_registers_change(self, address: int, from_value: int, to_value: int, srv_info: object) -> None:
+        self.written += 1
+
+    on_coils_change = on_holding_registers_change
 
     async def person(self, text: str) -> None:
         self.at_um = [at + 5000 * (f"axis {axis}" in text) for at, axis in zip((1000, 2000, 3000), "XYZ", strict=True)]
 
 
 @pytest.fixture
-async def plc(tmp_path: Path) -> AsyncIterator[tuple[Plc, str]]:
+def plc(tmp_path: Path) -> Iterator[tuple[Plc, str]]:
     made, port = Plc(), free_port()
-    device = SimDevice(id=1, simdata=[SimData(address=0, count=30, values=0, datatype=DataType.REGISTERS)], action=made.renew)
-    server = ModbusTcpServer(device, address=("127.0.0.1", port))
-    serving = asyncio.create_task(server.serve_forever(background=True))
-    await serving
+    server = ModbusServer("127.0.0.1", port, no_block=True, data_bank=made)
+    server.start()
     file = tmp_path / "plc.toml"
     text = (SHIPPED / "plc-positions.toml").read_text()
     file.write_text(text.replace('order = "CDAB" ', 'order = "DCBA" '))
     yield made, f"modbus+tcp://127.0.0.1:{port}?device={file}"
-    await server.shutdown()
+    server.stop()
 
 
 async def test_its_positions_and_flags_are_those_of_a_control(plc: tuple[Plc, str], tmp_path: Path) -> None:
