@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
-from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Point
+from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Item, Point
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
@@ -252,6 +252,10 @@ class Calibration(ConfigTable):
 
     ballbar: Certificate = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
     laser: Certificate = Field(default=None, description="of the laser")
+    ballbar_is: str = Field(
+        default="", max_length=400, description="maker, model and serial of the ball-bar; number and laboratory of its certificate"
+    )
+    laser_is: str = Field(default="", max_length=400, description="the same of the laser")
 
 
 class Nc(ConfigTable):
@@ -433,6 +437,7 @@ class MachineFile(ConfigTable):
     material: Material = Material()
     calibration: Calibration = Calibration()
     issuer: Issuer | None = None
+    item: Item = Item()
     nc: Nc = Nc()
     verify: Verify = Verify()
     mqtt: Mqtt = Mqtt()

@@ -160,14 +160,28 @@ class ConfigTable(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
 
+class Item(ConfigTable):
+    """The machine as a certificate identifies it."""
+
+    maker: str = Field(default="", max_length=200)
+    model: str = Field(default="", max_length=200)
+    serial: str = Field(default="", max_length=200)
+    place: str = Field(default="", max_length=200, description="where it stands, e.g. hall 3")
+
+
 class Issuer(ConfigTable):
-    """Who issues digital calibration certificates (`abbe report --out FILE.xml`)."""
+    """Who issues calibration certificates (ISO/IEC 17025, 7.8): with it reports become certificates, on paper, page and as DCC."""
 
     laboratory: str = Field(min_length=1, max_length=200)
     city: str = Field(min_length=1, max_length=200)
     country: str = Field(pattern="^[A-Z]{2}$", description="ISO 3166-1, two letters")
     person: str = Field(min_length=1, max_length=200, description="who is responsible")
+    address: str = Field(default="", max_length=400, description="of the laboratory: street and number")
+    accreditation: str = Field(default="", max_length=200, description="body and number of the accreditation; empty: none is claimed")
+    procedure: str = Field(default="", max_length=200, description="the laboratory's own procedure with its edition")
+    prefix: str = Field(default="", max_length=20, description="before the number of each certificate, e.g. CAL-")
     customer: str = Field(default="", max_length=200, description="of the machine; empty: the laboratory itself")
+    customer_address: str = Field(default="", max_length=400)
     place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
         default="customer", description="where machines are measured, as seen from the laboratory"
     )

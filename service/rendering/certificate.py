@@ -104,7 +104,9 @@ def _administrative(document: Document, issuer: Issuer, days: tuple[str, str]) -
         _tag("performanceLocation", issuer.place),
     )
     number = _tag("identification", _tag("issuer", "customer"), _tag("value", machine), _text(document, "name", "name of the machine"))
-    facts = "; ".join(f"{name}: {value}" for name, value in document.about.items())
+    known = document.item
+    named = {"Maker": known.maker, "Model": known.model, "Serial": known.serial} if known is not None else {}
+    facts = "; ".join(f"{name}: {value}" for name, value in {**document.about, **named}.items() if value)
     item = _tag("item", _text(document, "name", machine), _text(document, "description", facts), _tag("identifications", number))
     person = _tag("respPerson", _tag("person", _text(document, "name", issuer.person)), _tag("mainSigner", "true"))
     return _tag(

@@ -9,7 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, TypeAlias
 
-from abbe.service.domain.machine import Issuer
+from abbe.service.domain.machine import Issuer, Item
 from abbe.service.rendering.numbers import COVERAGE
 
 FORMAT = "abbe-report/1"
@@ -109,7 +109,7 @@ class Document:
     ``verdict``: sign, word and sentence; ``remarks``: important notes at the top; ``sections``: main results, printed before the figures;
     ``not_observable``: what this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
     figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper; ``days``: first and last day
-    of the measurement (ISO 8601), None if not on record; ``issuer``: of a digital certificate.
+    of the measurement (ISO 8601), None if not on record; ``issuer``, ``item``, ``issued``: laboratory, machine and day of a certificate.
     """
 
     kind: Kind
@@ -129,6 +129,8 @@ class Document:
     lang: str = "en"
     days: tuple[str, str] | None = None
     issuer: Issuer | None = None
+    item: Item | None = None
+    issued: str = ""
 
     @property
     def pictures(self) -> list[PictureBlock]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import io
 import json
 import math
@@ -24,11 +25,13 @@ from abbe.service.rendering.document import (
     TextTable,
     blocks,
 )
+from abbe.service.rendering.laboratory import certificate_of
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy, with_uncertainty
 
 COLUMNS = ("group", "symbol", "name", "value", "expanded", "k", "unit", "limit", "verdict", "method")
 _NUMBER = r"(?:n/a|[+−-]?\d[\d.]*(?:e[+−-]?\d+)?)"
 _NUMERIC = re.compile(rf"{_NUMBER}(?: (?:±|to) {_NUMBER})?(?: ?[×%])?")
+_TIME = re.compile(r"(\d{4}-\d\d-\d\d)T(\d\d:\d\d:\d\d)(?:\.\d+)?(?:Z|\+00:00)")
 NOTHING_HIDDEN = "No gap was found: this measurement shows everything that it should."
 
 
@@ -124,6 +127,7 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
     context["not_observable"] = data["not_observable"] if document.not_observable is None else data["not_observable"] or [NOTHING_HIDDEN]
     context["lang"], context["coverage"] = document.lang, tidy(COVERAGE)
     context["sections"], context["appendix"] = ([_block(s, draw) for s in some] for some in (document.sections, document.appendix))
+    context["certificate"] = certificate_of(document, hashlib.sha256(document_json(document).encode(errors="replace")).hexdigest())
     del context["figures"]
     clean: dict[str, Any] = _clean(context)
     return clean
@@ -150,7 +154,8 @@ def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:
 
 
 def _pairs(facts: Mapping[str, str]) -> list[dict[str, str]]:
-    return [{"name": name, "value": value} for name, value in facts.items()]
+    """Names and values; times to the second, as people read them."""
+    return [{"name": name, "value": _TIME.sub(r"\1 \2 UTC", value)} for name, value in facts.items()]
 
 
 def _right(columns: int, rows: Sequence[Sequence[str]]) -> list[bool]:

@@ -284,14 +284,17 @@ def rules_of(config: MachineFile | None) -> Rules:
         return Rules()
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     days = {"ballbar": config.calibration.ballbar, "laser": config.calibration.laser}
-    return Rules(limits, {k: v for k, v in days.items() if v is not None}, config.limits.temperature_c, config.material.by_axis())
+    known = {k: v for k, v in (("ballbar", config.calibration.ballbar_is), ("laser", config.calibration.laser_is)) if v}
+    valid = {k: v for k, v in days.items() if v is not None}
+    materials = config.material.by_axis()
+    return Rules(limits, valid, config.limits.temperature_c, materials, known, config.issuer, config.item)
 
 
-def certified(document: Document, config: MachineFile | None, measured_on: date | None) -> Document:
-    """The report with the issuer of a digital certificate from a machine file and, where it has none, the day of the measurement."""
+def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:
+    """The report as a certificate of the laboratory in the rules, if they name one; ``measured_on``: day of the measurement, if the
+    report does not know it; ``issued``: of the certificate."""
     days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
-    issuer = None if config is None else config.issuer
-    return replace(document, issuer=issuer, days=days)
+    return replace(document, issuer=rules.issuer, item=rules.item, days=days, issued=issued.isoformat())
 
 
 def numbered_report(store: Store, what: str, number: int, rules: Rules, machine: str | None = None) -> Document:

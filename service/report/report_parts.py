@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
-from abbe.service.domain.machine import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, Issuer, Item
 from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
@@ -46,13 +46,17 @@ class Rules:
     """Rules from a machine file.
 
     ``limits_um``: of figures, named as in `figure_rows`; ``calibrated_until``: certificates; ``temperature_c``: allowed, of the air;
-    ``materials``: expansion of the scales by axis.
+    ``materials``: expansion of the scales by axis; ``instruments``: what identifies each, with its certificate; ``issuer``, ``item``: of a
+    certificate, None without a laboratory.
     """
 
     limits_um: Mapping[str, float] = field(default_factory=dict)
     calibrated_until: Mapping[str, date] | None = None
     temperature_c: tuple[float, float] | None = None
     materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
+    instruments: Mapping[str, str] = field(default_factory=dict)
+    issuer: Issuer | None = None
+    item: Item | None = None
 
 
 def machine_facts(machine: Doc) -> dict[str, str]:
@@ -72,8 +76,9 @@ def instruments(runs: Sequence[Run], campaign: Doc, rules: Rules) -> list[Instru
 def _certificate(kind: str, rules: Rules) -> str:
     if rules.calibrated_until is None:
         return "not in the data; a machine file (-m) states it"
-    day = rules.calibrated_until.get(kind)
-    return "none stated in the machine file" if day is None else f"valid to {day.isoformat()}"
+    day, known = rules.calibrated_until.get(kind), rules.instruments.get(kind, "")
+    valid = "none stated in the machine file" if day is None else f"valid to {day.isoformat()}"
+    return f"{known}; {valid}" if known else valid
 
 
 def _known(kind: str, runs: Sequence[Run], campaign: Doc) -> str:

@@ -7,13 +7,19 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
+from datetime import date
 from pathlib import Path
 
 import pytest
 from playwright.sync_api import Browser, Locator, Page
 
+from abbe.service.rendering.document_page import write_document
+from abbe.service.report.report import certified, numbered_report
+from abbe.service.report.report_parts import Rules
+from abbe.service.storage.store import Store
 from tests.conftest import ROOT
 from tests.pages_world import Filled, filled_once, served
+from tests.service.rendering.test_certificate import ITEM, LABORATORY
 from tests.system.test_serve_screens import log_in
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
@@ -72,6 +78,22 @@ def test_the_report_of_a_solution(page: Page, filled: Filled, tmp_path: Path) ->
     abbe("solve", filled.campaign, "--db", filled.url, "--report", report)
     page.goto(report.as_uri())
     kept(page, "report-solution", tmp_path, 900)
+
+
+@pytest.mark.skipif(FOLDER is None, reason="tested beside its writer; `make pictures` writes the sample")
+def test_the_sample_of_a_certificate(filled: Filled) -> None:
+    until, bar, laser = (
+        date(2027, 5, 31),
+        "Example, bar, serial 1; certificate 12 of laboratory L",
+        "Example, laser, serial 2; certificate 13 of L",
+    )
+    rules = Rules(
+        {"body_diagonal_um": 20.0, "helix_rms_um": 5.0}, {"ballbar": until, "laser": until}, instruments={"ballbar": bar, "laser": laser},
+        issuer=LABORATORY, item=ITEM,
+    )  # fmt: skip
+    with Store.open(filled.url) as store:
+        document = certified(numbered_report(store, "verification", 24, rules), rules, date(2026, 11, 27), date(2026, 11, 27))
+    write_document(document, ROOT / "docs" / "sample-certificate.pdf")
 
 
 @pytest.mark.skipif(FOLDER is None, reason="the demonstration has tests of its own; its pictures are made by `make pictures`")

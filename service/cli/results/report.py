@@ -63,6 +63,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     needs [issuer] in the machine file and is not signed.
     """
     from abbe.service.campaign_data.campaign_folder import is_folder
+    from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
     from abbe.service.report.report import NUMBERED, certified, rules_of
@@ -76,7 +77,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     rules = rules_of(config)
     # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
     url = database_url(db, machine if db is None else None)
-    document = certified(_document(what, number, of, url, rules), config, _day(measured_on))
+    document = certified(_document(what, number, of, url, rules), rules, _day(measured_on), SystemClock().utc().date())
     targets = out or [Path(default_name(document))]
     for target in targets:
         write_document(document, target)

@@ -17,7 +17,7 @@ from abbe.service.queries import results
 from abbe.service.queries.reader import as_stored, storable
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_page import FORMS, default_name
-from abbe.service.report.report import numbered_report, stored_report
+from abbe.service.report.report import certified, numbered_report, stored_report
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
 from abbe.service.web.login.access import needs
@@ -168,7 +168,7 @@ def add_reports(app: FastAPI, sources: Sources) -> None:
 
 def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, machine: str | None) -> tuple[str, bytes]:
     with as_stored():
-        document = _document(sources, kind, number, machine)
+        document = certified(_document(sources, kind, number, machine), sources.rules, None, sources.reader.clock.utc().date())
         found = FORMS[f".{form}"](document)
     name = default_name(document).removesuffix(".pdf") + f".{form}"
     return name, found.encode() if isinstance(found, str) else found

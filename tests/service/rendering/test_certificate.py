@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import os
+import re
 import shutil
 import warnings
 from collections.abc import Iterator
@@ -10,6 +12,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import pypdf
 import pytest
 from aqdefreader import DfqFile, read_dfq_file
 from dcc_json_toolkit import DccSchema
@@ -20,12 +23,13 @@ from signxml.exceptions import InvalidDigest
 from xmlschema import XMLResource, XMLSchema10
 from xmlschema.exceptions import XMLResourceParseError
 
-from abbe.service.domain.machine import Issuer
+from abbe.service.domain.machine import Issuer, Item
 from abbe.service.errors import FileFormatError
 from abbe.service.rendering import qif
 from abbe.service.rendering.aqdef import document_dfq
 from abbe.service.rendering.certificate import UNITS, document_dcc
 from abbe.service.rendering.document import Document, Instrument, ReportFigure
+from abbe.service.rendering.document_page import document_html, document_pdf
 from abbe.service.rendering.qif import document_qif
 from tests.conftest import Require
 
@@ -245,3 +249,46 @@ def test_every_figure_is_in_qif_with_u_unit_limit_and_status() -> None:
     assert (len(set(numbers)), int(root.get("idMax"))) == (len(numbers), max(numbers))
     with pytest.raises(FileFormatError, match="QIF holds figures"):
         document_qif(replace(DOCUMENT, figures=[]))
+
+
+LABORATORY = Issuer(
+    laboratory="Plant 2, metrology", address="Ringstr. 1", city="Bonn", country="DE", person="A. Bär", procedure="VA-17, edition 3",
+    prefix="CAL-", customer="Fräserei Muster", customer_address="Talweg 2, Köln",
+)  # fmt: skip
+ITEM = Item(maker="Muster", model="M 5", serial="4711", place="hall 3")
+BAR = Instrument("ball-bar", "Maker, serial 1; certificate 12 of laboratory L; valid to 2027-05-31", "length calibrated")
+WHOLE = replace(DOCUMENT, issuer=LABORATORY, item=ITEM, issued="2026-11-24", instruments=[BAR])
+
+
+def pages_of(document: Document) -> list[str]:
+    return [" ".join(page.extract_text().split()) for page in pypdf.PdfReader(io.BytesIO(document_pdf(document))).pages]
+
+
+def test_a_laboratory_makes_a_report_a_certificate_with_what_iso_17025_wants() -> None:
+    pages = pages_of(WHOLE)
+    number = re.search(r"CAL-[0-9a-f]{4}-[0-9a-f]{4}-[0-9a-f]{4}", pages[0])
+    assert number is not None
+    assert all(number[0] in page and f"page {n} of {len(pages)}" in page for n, page in enumerate(pages, 1))
+    text = " ".join(pages)
+    parties = ("Ringstr. 1, Bonn, DE", "none is claimed", "Fräserei Muster, Talweg 2, Köln", "A. Bär")
+    item = ("Muster, M 5, serial 4711", "at the customer's, hall 3", "2026-11-22 to 2026-11-23", "Issued on 2026-11-24")
+    how = ("VA-17, edition 3; ISO 230-2", "certificate 12 of laboratory L", "ISO 14253-1", "traceable to the SI through")
+    limits = ("Calibration certificate", "relate only to the item", "reproduced in full only", "No calibration interval")
+    for words in (*parties, *item, *how, *limits):
+        assert words in text, words
+    assert "Missing for" not in text
+    assert number[0] in document_html(WHOLE)
+    other = replace(WHOLE, figures=FIGURES[1:])
+    assert number[0] not in pages_of(other)[0], "other results have another number"
+    later = replace(WHOLE, issued="2026-11-25")
+    assert number[0] in pages_of(later)[0], "a copy of another day has the same"
+
+
+def test_what_is_missing_for_a_certificate_is_said_and_nothing_is_claimed_for_it() -> None:
+    text = " ".join(pages_of(replace(DOCUMENT, days=None)))
+    for clause in ("7.8.2.1 b", "7.8.2.1 g", "7.8.2.1 i", "7.8.4.1 c"):
+        assert clause in text, clause
+    assert "traceability is not stated" in text
+    assert "traceable to the SI" not in text
+    for kind, issuer in (("push", LABORATORY), ("campaign", None)):
+        assert "certificate states" not in " ".join(pages_of(replace(WHOLE, kind=kind, issuer=issuer)))

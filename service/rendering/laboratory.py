@@ -1,0 +1,88 @@
+"""A report as a calibration certificate on paper: what ISO/IEC 17025 (7.8.2, 7.8.4) wants beside the results, and what is missing."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from abbe.service.domain.machine import Issuer
+from abbe.service.rendering.document import Document
+
+TITLE = "Calibration certificate"
+OF_MEASUREMENTS = ("run", "campaign", "verification")
+WHOLE = "This certificate may be reproduced in full only, unless the laboratory has approved otherwise in writing."
+ONLY = "The results relate only to the item identified above, as it was measured, at the place and on the days stated."
+INTERVAL = "No calibration interval is recommended."
+PLACES = {"laboratory": "in the laboratory", "customer": "at the customer's", "laboratoryBranch": "in a branch of the laboratory"}
+
+
+def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
+    """Number, facts, statements and what is missing of a certificate; None without a laboratory or without a measurement.
+
+    ``digest``: SHA-256 of the report, of which the number is made: equal results have one number, other results another.
+    """
+    issuer = document.issuer
+    if issuer is None or document.kind not in OF_MEASUREMENTS:
+        return None
+    number = issuer.prefix + "-".join(digest[k : k + 4] for k in (0, 4, 8))
+    facts = {"Number": number, **_parties(issuer), **_what(document, issuer), "Authorised by": issuer.person}
+    pairs = [{"name": name, "value": value} for name, value in facts.items() if value]
+    missing = _missing(document, issuer)
+    return {
+        "title": TITLE,
+        "number": number,
+        "facts": pairs,
+        "statements": [_traceable(document), ONLY, INTERVAL, WHOLE],
+        "missing": missing,
+    }
+
+
+def _parties(issuer: Issuer) -> dict[str, str]:
+    town = f"{issuer.city}, {issuer.country}"
+    return {
+        "Laboratory": ", ".join(one for one in (issuer.laboratory, issuer.address, town) if one),
+        "Accreditation": issuer.accreditation or "none is claimed",
+        "Customer": ", ".join(one for one in (issuer.customer or issuer.laboratory, issuer.customer_address) if one),
+    }
+
+
+def _what(document: Document, issuer: Issuer) -> dict[str, str]:
+    item, days = document.item, document.days
+    named = [document.about.get("Machine", "")]
+    if item is not None:
+        named += [item.maker, item.model, f"serial {item.serial}" if item.serial else ""]
+    place = ", ".join(one for one in (PLACES.get(issuer.place, ""), "" if item is None else item.place) if one)
+    when = "" if days is None else days[0] if days[0] == days[1] else f"{days[0]} to {days[1]}"
+    methods = ", ".join(dict.fromkeys(figure.method for figure in document.figures if figure.method))
+    return {
+        "Item": ", ".join(one for one in named if one),
+        "Place of calibration": place,
+        "Calibrated on": when,
+        "Issued on": document.issued,
+        "Procedure": "; ".join(one for one in (issuer.procedure, methods) if one),
+    }
+
+
+def _missing(document: Document, issuer: Issuer) -> list[str]:
+    """What ISO/IEC 17025 wants and nobody has stated."""
+    item = document.item
+    wanted = [
+        (issuer.address, "address of the laboratory ([issuer] address)", "7.8.2.1 b"),
+        (issuer.customer_address or not issuer.customer, "address of the customer ([issuer] customer_address)", "7.8.2.1 e"),
+        (item is not None and item.serial, "serial number of the machine ([item] serial)", "7.8.2.1 g"),
+        (document.days is not None, "day of the calibration (--measured-on)", "7.8.2.1 i"),
+        (_identified(document), "serial and certificate of each instrument ([calibration] ballbar_is, laser_is)", "7.8.4.1 c"),
+    ]
+    return [f"{what}: {clause}" for there, what, clause in wanted if not there]
+
+
+def _identified(document: Document) -> bool:
+    return bool(document.instruments) and all(";" in one.certificate for one in document.instruments)
+
+
+def _traceable(document: Document) -> str:
+    if not _identified(document):
+        return "Metrological traceability is not stated: not every instrument is identified with its certificate."
+    text = "The results are traceable to the SI through the certificates of the instruments listed under Instruments"
+    if any("not calibrated" in one.known for one in document.instruments):
+        return f"{text}, but for results that rest on a length that is not calibrated there."
+    return f"{text}."
