@@ -24,7 +24,7 @@ def solved_and_last(tmp_path_factory):
 def corrected(run):
     """The same pose as a machine without errors would find it."""
     e = error_mm(*run.columns.q_mm[:, :2].T)
-    own = np.column_stack([e, np.zeros(len(e))]) @ run.setup.matrix
+    own = np.column_stack([e, np.zeros(len(e))]) @ run.setup.pose.matrix
     further = {**run.columns.further} | {
         f"deviation_{a}_mm": run.columns.further[f"deviation_{a}_mm"] + own[:, k] for k, a in enumerate("xy")
     }
