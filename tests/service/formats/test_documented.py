@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from abbe.service.errors import TableFileError
+from abbe.models.arrays import F1, F2
+from abbe.service.errors import FormatRefused, TableFileError
 from abbe.service.formats import skew
 from abbe.service.formats.files import FormatSettings, TextFile
-from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Motions, ProductTable, correction_at
+from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Motions, ProductTable, correction_at
 from abbe.service.formats.registry import FORMATS
 from tests.service.formats.page import PAGE, page
 from tests.service.formats.proof import SETTINGS, all_proofs
@@ -279,6 +282,31 @@ X EXX EYX EZX EAX EBX ECX
 0.0 0.02 0.01 0.07 0.00 0.0042 0.003
 10.0 0.00 -0.1 0.01 0.00 0.0011 0.002
 """
+
+
+def test_the_polynomial_of_a_real_gantry_is_held_at_the_nodes_and_bounded_between_them(shared: Path) -> None:
+    """calibxyzkins of a 5.3 m machine: position A j + B j² + C. Its errors of 60 mm are refused; a hundredth of them is held."""
+    text = (shared / "data" / "foreign" / "linuxcnc-gantry" / "calibrations_params_used.md").read_text()
+    a, b, c = (np.array(json.loads(m)) for m in re.findall(r"array\((\[\[.*?\]\])\)", text, re.S))
+
+    def error_mm(joints: F2) -> F2:
+        return np.asarray(joints @ (a - np.eye(3)).T + joints**2 @ b.T + c.T) / 100.0
+
+    def lattice(grids: tuple[F1, F1, F1], scale: float) -> Compensation:
+        nodes = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1)
+        return Compensation(lattice=Lattice(grids, -scale * error_mm(nodes.reshape(-1, 3)).reshape(nodes.shape)))
+
+    grids = tuple(np.linspace(0.0, length, n) for length, n in ((5300.0, 11), (5200.0, 11), (1000.0, 3)))
+    kins, exact = FORMATS["linuxcnc-kins"], FormatSettings(decimals=9)
+    with pytest.raises(FormatRefused, match="the largest allowed is 1 mm"):
+        kins.write(lattice(grids, 100.0), exact)
+    held = kins.read(kins.write(lattice(grids, 1.0), exact), exact)
+    nodes = np.stack(np.meshgrid(*grids, indexing="ij"), axis=-1).reshape(-1, 3)
+    between = nodes[(nodes < [5300.0, 5200.0, 1000.0]).all(axis=1)] + np.array([265.0, 260.0, 250.0])
+    still = np.ones((1, 3))
+    assert np.abs(correction_at(held, nodes, still) + error_mm(nodes)).max() < 1e-9
+    bend = np.abs(b).max(axis=0) / 100.0 @ (np.array([530.0, 520.0, 500.0]) ** 2 / 4.0)
+    assert np.abs(correction_at(held, between, still) + error_mm(between)).max() < bend
 
 
 def test_isg_example_is_read_number_by_number() -> None:
