@@ -23,7 +23,7 @@ Source: artefact-based self-calibration by reversal, Evans, Hocken and Estler, C
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -352,6 +352,20 @@ def _place(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nominal_mm
     expansion, warmer = _expansion(p, known)
     factor = 1.0 + scale + cmm + warmer * expansion
     return factor[:, None] * nominal_mm + form, np.asarray(factor)
+
+
+def form_rows(p: ArtefactPoints, features: Sequence[str], nominal_mm: F2, names: Sequence[str]) -> NDArray[np.float64]:
+    """Derivatives of the form of an artefact at features by the unknowns ``names`` of a solution, shape (n, 3, unknowns), artefact axes."""
+    at = {name: i for i, name in enumerate(names)}
+    out = np.zeros((len(nominal_mm), 3, len(names)))
+    for i, feature in enumerate(features):
+        for k in range(3):
+            if (name := f"form_{p.artefact}_{feature}_{LETTERS[k]}") in at:
+                out[i, k, at[name]] = 1.0
+    for name, shape in (_shapes(p, nominal_mm) | {f"scale_{p.artefact}": nominal_mm}).items():
+        if name in at:
+            out[:, :, at[name]] = shape
+    return out
 
 
 def _expansion(p: ArtefactPoints, known: Known) -> tuple[float, F1]:

@@ -10,10 +10,12 @@ import numpy as np
 
 from abbe.models.arrays import F1
 from abbe.models.solvers.artefact import LETTERS, ArtefactPoints, step_columns
+from abbe.models.solvers.artefact_shares import form_amounts
 from abbe.models.solvers.components import KINDS
 from abbe.models.solvers.engine import CampaignFit, CampaignProblem
 from abbe.models.solvers.fine import Score
 from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability.poses import NAMED, SWIRL
 from abbe.models.solvers.observations import RunData
 
 Settle = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
@@ -256,8 +258,8 @@ def _twist(joint: JointSolution) -> list[ArtefactFault]:
     for name in dict.fromkeys(p.artefact for _, p in mine):
         poses = [p for _, p in mine if p.artefact == name]
         places = {f: n for p in poses for f, n in zip(p.feature, p.nominal_mm, strict=True)}
-        amount = swirl_functional(poses[0], places, e.names)
-        if amount is None or len(poses) < 2:  # one pose cannot tell the part from the machine (`plate_fit`)
+        amount = form_amounts(poses[0], places, e.names)[list(NAMED).index(SWIRL)]
+        if not amount.any() or len(poses) < 2:  # one pose cannot tell the part from the machine (`plate_fit`)
             continue
         value, u = float(amount @ e.theta), float(np.sqrt(amount @ e.covariance @ amount))
         form = np.array([n.startswith(f"form_{name}_") for n in e.names])
@@ -283,21 +285,3 @@ def _share(p: ArtefactPoints, places: dict[str, F1], theta: F1, names: tuple[str
     form = theta[np.array(rows, dtype=np.int64)] + swirl * (theta[at[f"twist_{p.artefact}_0"]] if f"twist_{p.artefact}_0" in at else 0.0)
     free, left = (v - affine @ np.linalg.lstsq(affine, v, rcond=None)[0] for v in (swirl, form))
     return float(value**2 * (free**2).sum() / max(float((left**2).sum()), 1e-18))
-
-
-def swirl_functional(p: ArtefactPoints, places: dict[str, F1], names: tuple[str, ...]) -> F1 | None:
-    """Weights by which the unknowns of a form make its rotation growing with r^2, mm at the farthest feature; None without any."""
-    at = {n: i for i, n in enumerate(names)}
-    out, q = np.zeros(len(names)), (np.array(list(places.values())) - p.middle_mm) / p.reach_mm
-    swirl = np.stack([-q[:, 1], q[:, 0]], axis=1) * (q[:, :2] ** 2).sum(axis=1, keepdims=True)
-    turn = np.stack([-q[:, 1], q[:, 0]], axis=1)
-    swirl -= turn * (turn * swirl).sum() / max(float((turn**2).sum()), 1e-12)
-    norm = float((swirl**2).sum())
-    for i, feature in enumerate(places):
-        for k in range(2):
-            name = f"form_{p.artefact}_{feature}_{LETTERS[k]}"
-            if name in at and norm > 0.0:
-                out[at[name]] = swirl[i, k] / norm
-    if (twist := f"twist_{p.artefact}_0") in at:
-        out[at[twist]] = 1.0
-    return out if out.any() else None

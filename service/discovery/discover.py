@@ -92,7 +92,7 @@ def _without_artefacts(campaign: Campaign) -> tuple[Campaign, list[str]]:
     if len(artefacts) == len(campaign.runs):
         raise NotObservable(
             f"campaign {campaign.name} has only points of artefacts, which the search does not read",
-            f"`abbe solve {campaign.name}` names what moves with the part, screws and false triggers; discover with ball-bar or laser runs",
+            f"`abbe discover {campaign.name}` names what moves with the part and what stays with the machine, without a search",
         )
     return campaign.without(artefacts), [f"points of artefacts were left out of the search: {', '.join(artefacts)}"]
 

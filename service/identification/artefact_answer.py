@@ -9,6 +9,7 @@ from abbe.models.geometry.bases import SMOOTH_ORDER
 from abbe.models.geometry.chain import design
 from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import Fine
+from abbe.models.solvers.artefact_shares import field_shares, shares_text
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.poses import pose_rank
 from abbe.models.solvers.plate_fit import plate_fit
@@ -30,10 +31,11 @@ def only_artefacts(joint: JointSolution) -> bool:
 
 
 def artefact_lines(joint: JointSolution) -> list[str]:
-    """Return what the poses of an artefact hide and which pose would tell it, and the plain fit of every workpiece alone."""
+    """Return what the poses of an artefact hide and which pose would tell it, its share of the named fields, and the plain fit of every
+    workpiece alone."""
     rank = pose_rank(joint.data)
-    fits = [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
-    return ([rank.text] if rank is not None else []) + fits
+    told = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
+    return told + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
 
 
 def without_length(joint: JointSolution) -> bool:

@@ -16,6 +16,7 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import perpendicular, predict, setup_unknowns
 from abbe.models.solvers.priors import Priors
+from tests.experiments.calibration import plates
 from tests.experiments.calibration.families import CHAINS, FAMILIES, draw_machine
 from tests.experiments.calibration.folder import write_case
 from tests.experiments.calibration.judging import Case, Refused, judge, table
@@ -156,3 +157,30 @@ def test_a_mirror_on_the_spindle_turns_with_the_machine() -> None:
     turn = machine.motions(diagonal.axes_mm)[:, :, 3:].sum(axis=1)
     np.testing.assert_allclose(turning - fixed, np.einsum("ni,ni->n", np.cross(turn, beam), beside), rtol=0, atol=2e-5)
     assert np.abs(turning - fixed).max() > 5e-4
+
+
+@pytest.mark.parametrize(("kind", "sign"), [("hole", -1.0), ("work", 1.0)])
+def test_points_of_a_plate_show_the_machine_with_the_sign_of_their_source(tmp_path, kind, sign):
+    """Less the true deviation of the machine, what all poses have in common, a rigid motion and a scale each, only micrometres are left."""
+    name = plates.write_case(tmp_path, "big", kind, 0, seed=3)
+    read = lambda f: json.loads((tmp_path / "public" / name / f).read_text())  # noqa: E731
+    campaign = read("campaign.json")
+    machine, _ = draw_machine("big", np.random.default_rng([3, *name.encode()]))
+    left, raw = [], []
+    for run in (read(r["file"]) for r in campaign["runs"]):
+        c, pose = run["columns"], run["setup"]["pose"]
+        rows = [i for i, f in enumerate(c["feature"]) if not f.startswith("W")][:25]
+        at, matrix = np.array([c[f"{a}_mm"] for a in "xyz"]).T[rows], np.array(pose["matrix"])
+        tool = np.array(run["setup"]["tool_mm"])
+        own = replace(machine, pivots_mm=machine.pivots_mm - tool).deviation_mm(at) @ matrix
+        found = np.array([c[f"deviation_{a}_mm"] for a in "xy"], dtype=np.float64).T[rows]
+        n = {f["id"]: f["nominal_mm"][:2] for f in campaign["artefacts"]["A"]["features"]}
+        q = np.array([n[c["feature"][i]] for i in rows]) / 200.0
+        basis = np.stack([np.tile([1.0, 0.0], (25, 1)), np.tile([0.0, 1.0], (25, 1)), np.stack([-q[:, 1], q[:, 0]], 1), q], -1).reshape(
+            50, -1
+        )
+        for kept, value in ((raw, found), (left, found - sign * own[:, :2])):
+            kept.append(value.ravel() - basis @ np.linalg.lstsq(basis, value.ravel(), rcond=None)[0])
+    spread = [float(np.std(np.array(v) - np.mean(v, axis=0))) for v in (raw, left)]
+    assert spread[1] < min(2.5e-3, 0.6 * spread[0]), spread
+    assert (tmp_path / "points" / f"{name}.csv").exists()

@@ -83,9 +83,15 @@ def _flat(axes_mm: F2, p: ArtefactPoints, keep: list[int]) -> _Pose:
     names = {f: i for i, f in enumerate(dict.fromkeys(sorted(p.feature)))}
     _, first = np.unique([names[f] for f in p.feature], return_index=True)
     numbers = np.array([names[p.feature[i]] for i in first])
-    turn, nominal = p.matrix[keep][:, :2], p.nominal_mm[first][:, :2]
-    lies = nominal @ turn.T  # as stated: what was found differs by the errors themselves
-    return _Pose(lies + (axes_mm[first][:, keep] - lies).mean(axis=0), numbers, nominal, turn)
+    return _Pose(
+        stated_places(axes_mm[first], p.matrix, p.nominal_mm[first], keep), numbers, p.nominal_mm[first][:, :2], p.matrix[keep][:, :2]
+    )
+
+
+def stated_places(axes_mm: F2, matrix: F2, nominal_mm: F2, keep: list[int]) -> F2:
+    """Return the positions (n, 2) in the plane of the axes ``keep`` as stated: what was found differs by the errors themselves."""
+    lies = nominal_mm[:, :2] @ matrix[keep][:, :2].T
+    return np.asarray(lies + (axes_mm[:, keep] - lies).mean(axis=0))
 
 
 def _told(poses: list[_Pose], *, scale: bool) -> tuple[int, tuple[str, ...]]:
@@ -118,11 +124,12 @@ def _fields(q: F2) -> NDArray[np.float64]:
     return out
 
 
+SWIRL = "rotation growing with r²"
 NAMED: dict[str, Callable[[F2], F2]] = {
     "scale": lambda q: q,
     "difference of the scales": lambda q: q * [1.0, -1.0],
     "squareness": lambda q: q[:, ::-1],
-    "rotation growing with r²": lambda q: np.stack([-q[:, 1], q[:, 0]], 1) * (q**2).sum(1, keepdims=True),
+    SWIRL: lambda q: np.stack([-q[:, 1], q[:, 0]], 1) * (q**2).sum(1, keepdims=True),
     "scale growing with r²": lambda q: q * (q**2).sum(1, keepdims=True),
 }
 

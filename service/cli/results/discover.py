@@ -41,7 +41,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
     only if --db or -m names a database. After Ctrl-C the same command resumes. Runs at standstill with temperatures show the thermal
-    response instead (ISO 230-3), which is not stored.
+    response instead (ISO 230-3), points of artefacts what moves with the part and what stays with the machine; neither is stored.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc
@@ -53,7 +53,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
     if live:
         machine = _checked_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
-        if _standstill(found, plain=report is None and not live, as_json=as_json):
+        if _without_search(found, plain=report is None and not live, as_json=as_json):
             conclude(f"abbe {'report' if found.folder is None else 'import'} {quote(campaign)}", machine=machine, db=db, as_json=as_json)
             return
         job, journal = _started(found, store)
@@ -74,18 +74,24 @@ def discover(  # noqa: PLR0913 - one argument for each option
     conclude(then, machine=machine, db=None if more else db)
 
 
-def _standstill(campaign: Campaign, *, plain: bool, as_json: bool) -> bool:
-    """Print the thermal response of runs at standstill; False if these are other runs."""
+def _without_search(campaign: Campaign, *, plain: bool, as_json: bool) -> bool:
+    """Print the thermal response of runs at standstill, or what moves with an artefact; False if these are other runs."""
     from abbe.service.cli.common import answer
-    from abbe.service.discovery.standstill import answer_doc, at_standstill, lines_of, standstill_answer
+    from abbe.service.discovery import artefact_finding, standstill
     from abbe.service.errors import ConfigError
 
-    if not at_standstill(campaign.runs):
+    thermal = standstill.at_standstill(campaign.runs)
+    if not thermal and not artefact_finding.only_artefacts(campaign):
         return False
     if not plain:
-        raise ConfigError("--report and --live are not for runs at standstill", "leave them out; --json gives all figures")
-    found = standstill_answer(campaign.name, campaign.runs)
-    answer(answer_doc(found), *lines_of(found), as_json=as_json)
+        what = "runs at standstill" if thermal else "points of artefacts"
+        raise ConfigError(f"--report and --live are not for {what}", "leave them out; --json gives all figures")
+    if thermal:
+        response = standstill.standstill_answer(campaign.name, campaign.runs)
+        answer(standstill.answer_doc(response), *standstill.lines_of(response), as_json=as_json)
+    else:
+        found = artefact_finding.artefact_finding(campaign)
+        answer(artefact_finding.answer_doc(found), *artefact_finding.lines_of(found), as_json=as_json)
     return True
 
 

@@ -29,7 +29,7 @@ def write_case(folder: Path, family: str, number: int, seed: int, size: float = 
     setups = Setups(rng, cup_um=float(np.exp(rng.uniform(np.log(2.0), np.log(30.0)))))
     public = folder / "public" / name
     public.mkdir(parents=True, exist_ok=True)
-    head = _machine_block(machine)
+    head = machine_block(machine)
     for step in steps:
         shown = None if step.role == "sealed" else shown_mm(machine, step, setups, noise, rng)
         (public / f"{step.run}.json").write_text(json.dumps(_run(name, head, step, shown)))
@@ -66,7 +66,7 @@ def series(machine: TrueMachine, orders: int = ORDERS) -> F:
     return out
 
 
-def _machine_block(machine: TrueMachine) -> dict[str, Any]:
+def machine_block(machine: TrueMachine) -> dict[str, Any]:
     stroke, pivots = (dict(zip("XYZ", rows.tolist(), strict=True)) for rows in (machine.stroke_mm, machine.pivots_mm))
     return {"chain": machine.chain, "vertical_axis": "Z", "stroke_mm": stroke, "pivots_mm": pivots}
 

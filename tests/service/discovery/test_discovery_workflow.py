@@ -445,7 +445,7 @@ def test_a_finding_comes_back_from_json_as_it_was(folder: Path, search: Search) 
 
 
 def test_points_of_artefacts_are_not_searched(tmp_path: Path) -> None:
-    with pytest.raises(NotObservable, match=r"only points of artefacts.*`abbe solve plate` names what moves with the part"):
+    with pytest.raises(NotObservable, match=r"only points of artefacts.*`abbe discover plate` names what moves with the part"):
         job_of(artefact_campaign(tmp_path))
 
 

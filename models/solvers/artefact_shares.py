@@ -1,0 +1,140 @@
+"""What moves with an artefact and what stays with the machine: the named fields of a plane, in each of the two, with U and evidence.
+
+The form of the artefact and the map of the machine are unknowns of one solution; the poses tell them apart, or not. A field that the poses
+hide (`abbe.models.solvers.observability.poses`) is unknown if it is there at all: its split would be that of the priors.
+
+Evidence: log of the Savage-Dickey ratio of a normal prior and posterior at zero, nats (Dickey 1971).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.chain import design
+from abbe.models.machine import with_tool
+from abbe.models.solvers.artefact import ArtefactPoints, form_rows
+from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observability.poses import NAMED, PoseRank, stated_places
+
+COVERAGE = 2.0
+NATS = 5.0
+"""Least evidence for a field."""
+LEAST_MM = 0.3e-3
+"""A smaller field is none, however sure."""
+
+Verdict = Literal["with the part", "with the machine", "with both", "unknown", "none"]
+
+
+@dataclass(frozen=True)
+class Share:
+    """A field's amount at ``reach_mm`` from the centre, mm: of the part and of the machine, their standard uncertainties, evidence.
+
+    ``both_mm``, ``u_both_mm``: what the part shows on this machine (part minus machine, as a probe reads it).
+    """
+
+    field: str
+    part_mm: float
+    u_part_mm: float
+    part_nats: float
+    machine_mm: float
+    u_machine_mm: float
+    machine_nats: float
+    both_mm: float
+    u_both_mm: float
+    verdict: Verdict
+    reach_mm: float
+
+    @property
+    def text(self) -> str:
+        """One phrase for people."""
+        if self.verdict in ("none", "unknown"):
+            return f"{self.field} {self.verdict} ({_um(self.both_mm, self.u_both_mm)} part minus machine)"
+        part, machine = _um(self.part_mm, self.u_part_mm), _um(self.machine_mm, self.u_machine_mm)
+        return f"{self.field} {self.verdict} (part {part}, machine {machine}; evidence {self.part_nats:.0f} and {self.machine_nats:.0f})"
+
+
+def _um(value_mm: float, u_mm: float) -> str:
+    return f"{1e3 * value_mm:+.1f} ± {1e3 * COVERAGE * u_mm:.1f} µm"
+
+
+def shares_text(found: tuple[Share, ...], rank: PoseRank | None) -> str:
+    """Return one line on all fields, with the pose that would tell what is unknown; empty without any."""
+    if not found or rank is None:
+        return ""
+    line = f"At {found[0].reach_mm:.0f} mm from its centre: {'; '.join(s.text for s in found)}."
+    lost = [s.field for s in found if s.verdict == "unknown"]
+    cure = next(((name, told) for name, _, told in rank.cures if set(told) & set(lost)), None)
+    return line + (f" A further pose {cure[0]} would tell: {', '.join(cure[1])}." if cure is not None else "")
+
+
+def field_shares(joint: JointSolution, rank: PoseRank) -> tuple[Share, ...]:
+    """Return the share of every named field in part and machine."""
+    probed = [(r, r.points) for r in joint.data if r.points is not None and r.points.source == "probe"]
+    run, p = probed[0]
+    places = {f: n for _, q in probed for f, n in zip(q.feature, q.nominal_mm, strict=True)}
+    e, keep = joint.estimate, ["XYZ".index(a) for a in rank.plane]
+    form = form_amounts(p, places, e.names)
+    at = np.concatenate([stated_places(r.axes_mm, q.matrix, q.nominal_mm, keep) for r, q in probed])
+    middle, off = 0.5 * (at.min(axis=0) + at.max(axis=0)), next(k for k in range(3) if k not in keep)
+    machine = np.zeros((len(NAMED), len(e.names)))
+    points = np.insert(at, off, float(np.mean([r.axes_mm[:, off].mean() for r, _ in probed])), axis=1)
+    rows = design(with_tool(joint.machine, run.tool_mm), joint.terms, points)[:, keep].reshape(2 * len(at), -1)
+    machine[:, : len(joint.terms)] = _weights((at - middle) / p.reach_mm) @ rows
+    sign = np.array([_turned(name, p.matrix[keep][:, :2]) for name in NAMED])  # as the part lies in the first pose
+    out = []
+    for i, name in enumerate(NAMED):
+        both = sign[i] * form[i] - machine[i]
+        (part, u_part), (own, u_own), (sum_, u_sum) = (_known(e.theta, e.covariance, w) for w in (sign[i] * form[i], machine[i], both))
+        nats = [
+            _evidence(v, u, w, joint.prior_root) for v, u, w in ((part, u_part, form[i]), (own, u_own, machine[i]), (sum_, u_sum, both))
+        ]
+        seen = [n > NATS and abs(v) > LEAST_MM for n, v in zip(nats, (part, own, sum_), strict=True)]
+        out.append(
+            Share(name, part, u_part, nats[0], own, u_own, nats[1], sum_, u_sum, _verdict(seen, hidden=name in rank.hidden), p.reach_mm)
+        )
+    return tuple(out)
+
+
+def _verdict(seen: list[bool], *, hidden: bool) -> Verdict:
+    part, machine, both = seen
+    if hidden:
+        return "unknown" if both else "none"
+    if part and machine:
+        return "with both"
+    return "with the part" if part else "with the machine" if machine else "none"
+
+
+def _known(theta: F1, covariance: F2, weights: F1) -> tuple[float, float]:
+    return float(weights @ theta), float(np.sqrt(max(float(weights @ covariance @ weights), 0.0)))
+
+
+def _evidence(value: float, u: float, weights: F1, prior_root: F2) -> float:
+    before = float(np.linalg.norm(weights @ prior_root))
+    if u <= 0.0 or before <= 0.0:
+        return 0.0
+    return float(0.5 * (value / u) ** 2 - np.log(max(before / u, 1.0)))
+
+
+def _turned(name: str, turn: F2) -> float:
+    """Return the sign that a field gets when the part is turned by quarter turns."""
+    q = np.array([[0.3, 0.7], [-0.6, 0.4]])
+    field = NAMED[name]
+    return float(np.sign((field(q @ turn.T) * (field(q) @ turn.T)).sum()))
+
+
+def _weights(q: F2) -> F2:
+    """Return weights by which displacements (n, 2) at places q from the centre give the amounts of the named fields, shape (5, 2 n)."""
+    rigid = [np.tile([1.0, 0.0], (len(q), 1)), np.tile([0.0, 1.0], (len(q), 1)), np.stack([-q[:, 1], q[:, 0]], axis=1)]
+    basis = np.stack([*rigid, *(field(q) for field in NAMED.values())], axis=2).reshape(2 * len(q), -1)
+    return np.asarray(np.linalg.pinv(basis)[3:])
+
+
+def form_amounts(p: ArtefactPoints, places: dict[str, F1], names: tuple[str, ...]) -> F2:
+    """Return weights by which the unknowns of an artefact's form make the named fields, mm at its farthest feature, shape (5, unknowns)."""
+    nominal = np.array(list(places.values()))
+    q = (nominal - p.middle_mm)[:, :2] / p.reach_mm
+    return _weights(q) @ form_rows(p, tuple(places), nominal, names)[:, :2].reshape(2 * len(q), -1)

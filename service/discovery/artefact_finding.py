@@ -1,0 +1,83 @@
+"""Campaigns of artefacts: what moves with the part, what stays with the machine, and which pose would tell what these do not."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from abbe.models.solvers.artefact_shares import Share, field_shares
+from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
+from abbe.models.solvers.observability.poses import PoseRank, pose_rank
+from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.identification.artefact_answer import artefact_lines
+from abbe.service.identification.solve import Solved, solve_runs
+
+FORMAT = "abbe-artefact-finding/1"
+LEFT = 2.0
+"""Points that scatter by more than this factor of their repeatability hold something that neither part nor machine explains."""
+
+
+@dataclass(frozen=True, eq=False)
+class ArtefactFinding:
+    """``shares``: the named fields in part and machine, empty unless one plate lay in poses in a plane (``rank``). ``waves``: periods of
+    the machine's motions. ``scatter``: of the points, as multiple of their repeatability."""
+
+    campaign: str
+    solved: Solved
+    rank: PoseRank | None
+    shares: tuple[Share, ...]
+    waves: tuple[str, ...]
+    scatter: float
+
+    @property
+    def verdict(self) -> str:
+        """What moves with the part, what stays with the machine, what these poses cannot tell."""
+        if self.rank is None:
+            return "unknown: part and machine are told apart by name for one plate in a plane only; the solution still does it by points"
+        said = [
+            f"{where}: {', '.join(found)}"
+            for where, words in (
+                ("moves with the part", ("with the part", "with both")),
+                ("stays with the machine", ("with the machine", "with both")),
+                ("unknown, part or machine", ("unknown",)),
+            )
+            if (found := [s.field for s in self.shares if s.verdict in words] + list(self.waves if where.startswith("stays") else ()))
+        ]
+        if self.scatter > LEFT:
+            said.append(f"unknown, neither: points scatter {self.scatter:.1f} times their repeatability")
+        return "; ".join(said) or "none"
+
+
+def only_artefacts(campaign: Campaign) -> bool:
+    """Whether all runs of a campaign are of artefacts."""
+    return bool(campaign.runs) and all(r.is_artefact for r in campaign.runs)
+
+
+def artefact_finding(campaign: Campaign) -> ArtefactFinding:
+    """Solve the campaign and tell part and machine apart. Raises as `solve_runs`."""
+    solved = solve_runs(campaign.site, campaign.runs, instruments=campaign.doc.get("instruments"))
+    joint, rank = solved.joint, pose_rank(solved.joint.data)
+    fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
+    waves = dict.fromkeys(f"a wave of {w.period_mm:.4g} mm along {'XYZ'[w.axis]}" for w in fine if w.period_mm)
+    scatter = joint.noise_mm["artefact"] / DEFAULT_SIGMA_MM["artefact"]
+    return ArtefactFinding(campaign.name, solved, rank, () if rank is None else field_shares(joint, rank), tuple(waves), scatter)
+
+
+def lines_of(found: ArtefactFinding) -> list[str]:
+    """Return the finding line by line."""
+    return [f"verdict: {found.verdict}", *artefact_lines(found.solved.joint), *(flag.line for flag in found.solved.flags)]
+
+
+def answer_doc(found: ArtefactFinding) -> dict[str, Any]:
+    """Return the finding as JSON object; amounts in mm at ``reach_mm``, standard uncertainties."""
+    poses = None if found.rank is None else {"fields": found.rank.rank, "hidden": list(found.rank.hidden), "text": found.rank.text}
+    return {
+        "format": FORMAT,
+        "campaign": found.campaign,
+        "verdict": found.verdict,
+        "fields": [asdict(s) for s in found.shares],
+        "poses": poses,
+        "waves": list(found.waves),
+        "scatter": found.scatter,
+        "flags": [flag.line for flag in found.solved.flags],
+    }

@@ -1,0 +1,58 @@
+"""What moves with a plate, and what stays with the machine: amounts with U, and "unknown" where the poses cannot tell."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from abbe.models.solvers.observability.poses import NAMED, stated_places
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.cli.app import app
+from abbe.service.discovery.artefact_finding import artefact_finding
+from tests.artefact_campaign import campaign, error_mm, nominal
+
+REACH_MM = float(np.hypot(111.0, 111.0))
+
+
+def amounts(q: np.ndarray, moved: np.ndarray) -> list[float]:
+    """Named fields of displacements at places (n, 2) from the centre, by least squares beside rigid motions."""
+    columns = [
+        np.tile([1.0, 0.0], (len(q), 1)),
+        np.tile([0.0, 1.0], (len(q), 1)),
+        np.stack([-q[:, 1], q[:, 0]], 1),
+        *(f(q) for f in NAMED.values()),
+    ]
+    return np.linalg.lstsq(np.stack(columns, -1).reshape(2 * len(q), -1), moved.ravel(), rcond=None)[0][3:].tolist()
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_amounts_of_part_and_machine_are_those_that_were_put_in(tmp_path: Path, seed: int) -> None:
+    found = artefact_finding(from_folder(campaign(tmp_path, seed=seed)))
+    form = 0.02 * np.random.default_rng(seed).standard_normal((25, 2))
+    part = amounts((nominal() - 111.0) / REACH_MM, form)
+    probed = [r for r in found.solved.joint.data if r.points.source == "probe"]
+    at = np.concatenate([stated_places(r.axes_mm, r.points.matrix, r.points.nominal_mm, [0, 1]) for r in probed])
+    machine = amounts((at - 0.5 * (at.min(axis=0) + at.max(axis=0))) / REACH_MM, error_mm(*at.T))
+    for share, p, m in zip(found.shares, part, machine, strict=True):
+        assert abs(share.part_mm - p) < 3.0 * share.u_part_mm + 2e-5, share
+        assert abs(share.machine_mm - m) < 3.0 * share.u_machine_mm + 2e-5, share
+        if abs(m) > 1e-3 or abs(m) < 2e-4:
+            assert (share.verdict in ("with the machine", "with both")) == (abs(m) > 1e-3), share
+    assert "squareness" in found.verdict
+
+
+def test_what_these_poses_hide_is_unknown_and_the_pose_that_tells_is_named(tmp_path: Path) -> None:
+    folder = campaign(tmp_path, length=False)
+    done = CliRunner().invoke(app, ["discover", str(folder), "--without", "p2", "--json"])
+    assert done.exit_code == 0, done.output
+    found = json.loads(done.stdout)
+    verdicts = {f["field"]: f["verdict"] for f in found["fields"]}
+    assert verdicts["scale"] == verdicts["difference of the scales"] == verdicts["squareness"] == "unknown"
+    assert "turned by 90 degrees" in found["poses"]["text"]
+    assert "unknown, part or machine: scale, difference of the scales, squareness" in found["verdict"]
+    said = CliRunner().invoke(app, ["discover", str(folder), "--without", "p2"]).output
+    assert "A further pose turned by 90 degrees would tell: difference of the scales, squareness" in " ".join(said.split())
