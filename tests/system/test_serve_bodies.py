@@ -16,7 +16,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from abbe.service.channel.messages import PAGE_MEMORY_MB
+from abbe.service.config_schema import Web
 from abbe.service.core.web_process import OOM_SCORE_ADJ
 from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
@@ -84,10 +84,10 @@ def last_to_go(pid: int) -> int:
 def test_a_page_without_memory_is_replaced_and_the_core_stays(made: Running) -> None:
     """First in this file: a page that has answered much finds room in what it already has."""
     page, core = made.web, made.process.pid
-    assert (limit_b(page), limit_b(core)) == (PAGE_MEMORY_MB << 20, resource.RLIM_INFINITY)
+    assert (limit_b(page), limit_b(core)) == (Web().memory_mb << 20, resource.RLIM_INFINITY)
     assert (last_to_go(page), last_to_go(core)) == (OOM_SCORE_ADJ, 0)
     used_b = memory_kb(page, "VmData") << 10
-    resource.prlimit(page, resource.RLIMIT_DATA, (used_b, PAGE_MEMORY_MB << 20))  # nothing more: the limit has been reached
+    resource.prlimit(page, resource.RLIMIT_DATA, (used_b, Web().memory_mb << 20))  # nothing more: the limit has been reached
     until_s = time.monotonic() + PATIENCE_S
     while not ended(page, 0.1):
         assert time.monotonic() < until_s, "it goes on without memory"
@@ -95,7 +95,7 @@ def test_a_page_without_memory_is_replaced_and_the_core_stays(made: Running) -> 
             made.http.get("/api/v1/openapi.json", headers=made.who["viewer"])
     made.process.expect("starting it again")
     assert made.http.get("/readyz").status_code == 200
-    assert (made.process.pid, limit_b(made.web)) == (core, PAGE_MEMORY_MB << 20)
+    assert (made.process.pid, limit_b(made.web)) == (core, Web().memory_mb << 20)
 
 
 @pytest.mark.timeout(300)
