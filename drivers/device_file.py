@@ -214,7 +214,7 @@ class DeviceFile(DeviceTable):
             if missing := sorted(set(self.values) - groups):
                 raise ValueError(f"line.pattern has no group (?P<{missing[0]}>...) for values.{missing[0]}")
             if (self.line.mode == "poll") != bool(self.line.ask):
-                raise ValueError("line.ask is what a poll sends, and a stream needs none")
+                raise ValueError("line.ask is the request of a poll; a stream has none")
             if self.line.who and not self.line.answers:
                 raise ValueError("line.who needs line.answers")
             return
@@ -243,7 +243,7 @@ def port_settings(file: DeviceFile) -> dict[str, Any]:
 
 
 def find(name: str) -> Path:
-    """Return the path of a device file: ``name.toml`` of the shipped ones if ``name`` has neither dot nor slash."""
+    """Return the path of a device file. A name without dot and slash means the built-in file ``name.toml``."""
     return Path(name) if "." in name or "/" in name else SHIPPED / f"{name}.toml"
 
 

@@ -7,7 +7,7 @@ acts: in between, nothing does. Whatever interrupts this leaves compensation off
 journal. A crash loses the staged table and the lease, which are of this process.
 
 Weaker than two banks (docs/how-to/correct.md): nothing acts while tables are exchanged; interlocks are looked at before each switch, not by
-the control at that instant; there is no lease, so no other program may write tables; content that nobody can explain is left to a person.
+the control at that instant; there is no lease, so no other program may write tables; content of unknown origin is left to a person.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class OneBankTables:
         return getattr(self.one_bank_control, name)
 
     async def comp_status(self) -> CompStatus:
-        """Read state and table twice alike. The generation is a CRC of both.
+        """Read state and table until two reads agree. The generation is a CRC of both.
 
         Raises
         ------

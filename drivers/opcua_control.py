@@ -110,7 +110,7 @@ class OpcUaControl(ListenedControl):
 
 
 class OpcUaFiles:
-    """Files that a control offers as file objects (OPC 10000-20): ``nodes``, node by name of the file."""
+    """Files that a control offers as file objects (OPC 10000-20). ``nodes`` maps a file name to its OPC UA node."""
 
     def __init__(self, url: str, client: Any, nodes: dict[str, str]) -> None:
         self.name, self._client = url, client
@@ -165,7 +165,7 @@ async def _answered(name: str, operation: str, answer: Awaitable[T]) -> T:
     except OSError as error:
         raise LinkDown(name, operation, str(error), "is the server switched on?") from None
     except ua.UaError as error:
-        raise BadFrame(name, operation, str(error) or type(error).__name__, "are the nodes of the URL those of this server?") from None
+        raise BadFrame(name, operation, str(error) or type(error).__name__, "do the nodes of the URL belong to this server?") from None
 
 
 async def _ended(client: Any) -> None:

@@ -199,7 +199,7 @@ def mean_of(values: F1, u: F1) -> tuple[float, float]:
 
 
 def jumps(change: float, u_change: float, limit: float) -> bool:
-    """Tell whether a figure grew by more than its uncertainty explains.
+    """Return whether a figure grew by more than its uncertainty explains.
 
     It serves series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, this test takes the stated uncertainties
     at face value; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for contributions missing in them.

@@ -82,7 +82,7 @@ def _with_files(machine: MachineFile, folder: Path) -> MachineFile:
 
 
 def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:
-    """Refuse a list entry with keys of both its forms, even if a value equals its default: nobody can know which form was meant."""
+    """Refuse a list entry with keys of both its forms, even if a value equals its default: the intended form would be ambiguous."""
     for name, (one, other) in EXCLUSIVE_KEYS.items():
         for number, entry in enumerate(values.get(name, ()), start=1):
             found, more = [key for key in one if key in entry], [key for key in other if key in entry]

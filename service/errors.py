@@ -226,7 +226,7 @@ class DevicesNotReady(AbbeError):
 
 
 class ProbeFault(MeasurementFault):
-    """The touch probe cannot measure a feature. The stylus was taken out first, or backed off; earlier features are kept."""
+    """The touch probe cannot measure a feature. The stylus was withdrawn first, or backed off; earlier features are kept."""
 
     code = "PRB-000"
 

@@ -1,4 +1,4 @@
-"""The text of a new machine file, with a comment for whoever edits it; `abbe.service.config` reads it."""
+"""The text of a new machine file, with comments for the person who edits it; `abbe.service.config` reads it."""
 
 from __future__ import annotations
 

@@ -115,7 +115,7 @@ class Box:
         await self.accept()
 
     def error_of(self, end: SegmentEnd) -> DriverError:
-        """Return the driver error that tells why a stream cannot continue."""
+        """Return the driver error for a stream that cannot continue."""
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):

@@ -342,7 +342,7 @@ class Conversation:
     send : callable
         Opens the line if necessary, and sends the bytes.
     counters : BarCounters
-        Counters of the line: they tell a wrong baud rate (bytes without a valid frame) from a silent box (no bytes).
+        Counters of the line: they distinguish a wrong baud rate (bytes without a valid frame) from a silent box (no bytes).
     answer_s : callable
         Returns the longest wait for a reply, s.
     backlog : callable

@@ -84,7 +84,7 @@ class ModbusController(Banks):
     def _at_target(self, block: reg.StatusBlock, operation: str, target_mm: Point) -> ControllerStatus:
         if self._counts(block.status.position_mm, operation) != self._counts(target_mm, operation):
             detail = f"the {operation} ended at {block.status.position_mm} instead of {tuple(target_mm)}: aborted"
-            raise DeviceFault(self.name, operation, detail, "start again when the reason is known")
+            raise DeviceFault(self.name, operation, detail, "find the reason, then start again")
         return block.status
 
     async def load_path(self, points_mm: Sequence[Point]) -> None:

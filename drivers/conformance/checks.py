@@ -54,7 +54,7 @@ async def identity(probe: DeviceUnderTest, file: DeviceFile | None) -> list[Devi
         return [DeviceCheck("identity", FAILED, f"it is {first}, then {second}")]
     named = f"{first.model} {first.serial_no}".strip()
     if file is not None and not (file.identity or file.serial_no or (file.line is not None and file.line.who)):
-        return [DeviceCheck("identity", NOT_PROVED, f"{named}: nothing in the device file tells it from another device")]
+        return [DeviceCheck("identity", NOT_PROVED, f"{named}: nothing in the device file identifies it")]
     found = [DeviceCheck("identity", PASSED, named)]
     if file is not None and file.modbus is not None:
         whole = any(SIZE[known.type] > 1 for known in file.identity)
@@ -88,14 +88,12 @@ def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if stamp is not None:
         return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")
     if file.line is not None:
-        return DeviceCheck(
-            "freshness", PASSED, "every reading was the answer to a question" if file.line.mode == "poll" else "a line of its own"
-        )
+        return DeviceCheck("freshness", PASSED, "every reading answered a request" if file.line.mode == "poll" else "a line of its own")
     if file.limits.update_s is not None:
         return DeviceCheck(
             "freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s"
         )
-    return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
+    return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: old values look like new ones")
 
 
 def _clock(taken: list[Sample]) -> list[DeviceCheck]:
@@ -202,7 +200,7 @@ def _other_order(file: DeviceFile | None, name: str, words: tuple[tuple[int, ...
 
 
 def _bad(file: DeviceFile | None) -> list[str]:
-    """What tells an invalid reading."""
+    """Test that an invalid reading is recognised."""
     if file is None:
         return ["an error of its driver"]
     found: list[str] = sorted({flag.means for flag in file.flags} & INVALID)
@@ -214,7 +212,7 @@ async def quality(probe: DeviceUnderTest, file: DeviceFile | None, ask: Ask) -> 
     """Have the beam blocked or the plunger lifted: the reading must become invalid."""
     bad = _bad(file)
     if not bad:
-        return DeviceCheck("quality", NOT_PROVED, "the device file names nothing by which an invalid reading could be told")
+        return DeviceCheck("quality", NOT_PROVED, "the device file has no mark of an invalid reading")
     try:
         await ask("Block the beam, or lift the plunger out of its range.")
         try:

@@ -68,7 +68,7 @@ async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy
         return (
             found
             if proxy.cuts
-            else [*found, DeviceCheck(Fault.CUT.value, CheckVerdict.NOT_PROVED, "a serial line has none: pull its plug")]
+            else [*found, DeviceCheck(Fault.CUT.value, CheckVerdict.NOT_PROVED, "a serial line has no connection to cut: pull its plug")]
         )
     except DriverError as error:
         return [DeviceCheck("replies", CheckVerdict.FAILED, str(error))]
@@ -170,9 +170,7 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
     finally:
         await probe.close()
     if about is not None and not isinstance(about.url, ModbusRtuUrl):
-        found.append(
-            DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry none: a digit that is flipped on the way cannot be seen")
-        )
+        found.append(DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry none: a corrupted digit cannot be detected"))
     if options.faults:
         found += await _faults(text, about, options.role)
     return _report(text, about, options.role, info, found, utc)

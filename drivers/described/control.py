@@ -88,7 +88,7 @@ class ListenedControl:
             raise ReplyTimeout(self.name, "read status", detail, "does its program run?")
 
     def _refuse(self, operation: str, what: str) -> NoReturn:
-        raise NotProved(self.name, operation, f"this control can only be listened to: {what}", "connect a control that proves it")
+        raise NotProved(self.name, operation, f"Abbe can only read this control: {what}", "connect a control that proves it")
 
     async def comp_status(self) -> CompStatus:
         """Raise NotProved: there is no compensation table to be seen."""

@@ -63,7 +63,7 @@ class LineSource:
         """
         await self._opened()
         if await self._ask(command.send, command.answer) is None:
-            raise BadFrame(self.name, operation, "the answer is not that of the device file", "does the device file fit?")
+            raise BadFrame(self.name, operation, "the answer does not match the device file", "check the device file")
 
     async def _opened(self) -> None:
         if not self._link.is_open:
@@ -128,9 +128,7 @@ class LineSource:
                 return {name: float(found[name].replace(" ", "")) for name in self._file.values}
         except (ValueError, AttributeError):  # a group is empty, or not a number
             pass
-        raise BadFrame(
-            self.name, "read", f"the line {line[:60]!r} is not of the form of the device file", "baud rate, parity, output format?"
-        )
+        raise BadFrame(self.name, "read", f"the line {line[:60]!r} does not match the device file", "baud rate, parity, output format?")
 
     async def close(self) -> None:
         """Close the port. Closing twice does nothing."""
@@ -198,7 +196,7 @@ class StreamedLines(LineSource):
     def __init__(self, file: DeviceFile, link: ByteLink) -> None:
         super().__init__(file, link)
         if file.line is not None and (file.line.who or file.zero or file.clear):
-            raise NotProved(self.name, "open", "questions and commands to a device that streams are not supported", "describe it as a poll")
+            raise NotProved(self.name, "open", "a device that streams takes no requests or commands", "describe it as a poll")
         self._task: asyncio.Task[None] | None = None
         self._news = asyncio.Condition()
         self._latest: CountSnapshot | None = None

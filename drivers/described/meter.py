@@ -54,7 +54,7 @@ class DescribedMeter:
         return TO_OURS[value.unit][0] * (self.file.limits.resolution or value.scale)
 
     async def identify(self) -> DeviceInfo:
-        """Identify the device anew; its zero is taken again afterwards. Raises WrongDevice and the errors of communication."""
+        """Identify the device again and discard its zero. Raises WrongDevice and the errors of communication."""
         info = await self.source.identify()
         self._zero_mm = None
         self._raw.clear()

@@ -15,10 +15,10 @@ from abbe.drivers.links.incidents import Incidents
 
 @dataclass(frozen=True, slots=True)
 class CountSnapshot:
-    """Counts of one reply or one line, by name of the value. ``number``: of the reply or line since the device was opened.
+    """Counts of one reply or line, by name of the value.
 
-    ``words``: Modbus: the registers of each value, to try other byte orders. ``host_s``: monotonic host seconds of the arrival. ``epoch``:
-    changes with every new connection after which the device may have restarted.
+    ``number``: counts the replies or lines since the device was opened. ``words``: Modbus registers of each value, to test the byte order.
+    ``host_s``: arrival, monotonic host seconds. ``epoch``: changes with each new connection after which the device may have restarted.
     """
 
     host_s: float

@@ -354,7 +354,7 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
-    """Tell whether the standstill of place ``k`` may also be that of the previous or next pass over the same target.
+    """Return whether the standstill of place ``k`` may also be that of the previous or next pass over the same target.
 
     This is so if only one turning point lies between both passes, and neither it nor the other pass has a standstill.
     """
@@ -437,7 +437,7 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
-    """Tell whether two matches assign most of the standstills that both contain to different places."""
+    """Return whether two matches assign most of the standstills that both contain to different places."""
     first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
     both = first.keys() & second.keys()
     return 2 * sum(first[s] != second[s] for s in both) > len(both)

@@ -153,7 +153,7 @@ def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] 
     if not wanted <= observable_names:
         raise ValueError(
             f"motion tables: {', '.join(sorted(wanted - observable_names))} cannot be written under their own names: the readings do not "
-            "tell them apart from other motions. Measure with a second tool length, or make tables for this tool only (any_tool=False)"
+            "separate them from other motions. Measure with a second tool length, or make tables for this tool only (any_tool=False)"
         )
     return wanted
 

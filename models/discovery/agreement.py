@@ -24,7 +24,7 @@ BLOCKS, SHORTEST = 12, 8
 the usual memory has fallen to a tenth there, so block sums are nearly independent."""
 FREE_MM = 1.0
 """Wide prior of a run's own unknowns."""
-NO_NOISE = "the fitted runs do not tell the noise of their instrument"
+NO_NOISE = "the noise of the instrument cannot be estimated from the fitted runs"
 TOO_FEW = "too few of their readings count"
 
 

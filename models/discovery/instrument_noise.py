@@ -24,7 +24,7 @@ SAME_MM, AGAIN = 1.0, 0.2
 CLEARLY = 0.85
 """The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
 FINE, QUIET, SHORTEST = 4, 0.25, 24
-"""Order of the differences of neighbours that tell the noise whatever the model misses (a wave of eight readings adds 0.5 %); share of an
+"""Order of the differences of neighbours that show the noise even of an incomplete model (a wave of eight readings adds 0.5 %); share of an
 instrument's runs that may be quieter than its noise, because effects reach the other runs; and readings that a run must have."""
 CROWD, TURN_MM, CREEP_MM_S = 0.35, 3.0, 4.5
 """Share of eleven neighbours from which off readings are a disturbance, no accident; travel after a reversal that a spike
@@ -79,9 +79,9 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
 
 
 def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> dict[str, Colour]:
-    """Estimate how much the noise of each instrument remembers, from residuals as for `level`; the usual colour unless clearly another.
+    """Estimate the autocorrelation of each instrument's noise from residuals as for `level`; without clear evidence keep the usual colour.
 
-    Clearly: by `REMEMBERS` over all runs, and better in `MOST` of them, because what happens once or at one place is no noise.
+    Clear evidence: the log likelihood gains `REMEMBERS` over all runs and improves in `MOST` of them, because a single event is not noise.
     """
     out: dict[str, Colour] = {}
     ends = np.cumsum(lengths)
@@ -102,7 +102,7 @@ def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colou
 
 
 def comes_back(paths: Sequence[Path], residual: Sequence[F1], kind: str) -> bool:
-    """Whether residuals of an instrument come back in runs along the same path (`AGAIN`), or no two runs can tell; then they are no noise.
+    """Whether residuals of an instrument repeat in runs along the same path (`AGAIN`), so that they are not noise; True without such runs.
 
     ``residual``: one array (n,) per run.
     """

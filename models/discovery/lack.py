@@ -73,7 +73,7 @@ def repeat_steps(case: Case, kind: str) -> F1:
     """Return the differences, mm, of successive dwell readings at the same position of a set-up, approached from the same side.
 
     Slow drift contributes little to them; errors of position, direction and set-up contribute nothing. Each run of a laser has its own
-    zero, so of the differences between two runs their mean is taken out.
+    zero, so the mean of the differences between two runs is removed.
     """
     visits: dict[object, list[tuple[float, float, str]]] = {}
     for run in case.runs:
@@ -93,7 +93,7 @@ def repeat_steps(case: Case, kind: str) -> F1:
 
 
 def _about_mean(differences: F1) -> F1:
-    """Take out the mean of the differences between two runs; the rest is enlarged by the degree of freedom that this costs."""
+    """Remove the mean of the differences between two runs; the rest is enlarged for the lost degree of freedom."""
     n = differences.size
     return np.asarray((differences - differences.mean())[: n if n > 1 else 0] * np.sqrt(n / max(n - 1, 1)))
 

@@ -20,7 +20,7 @@ from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
 REMAINS = 0.6
-"""Readings are mixed up if less than this share of the misfit of the whole campaign remains with them put right ..."""
+"""Readings are mixed up if their correction leaves less than this share of the misfit of the whole campaign ..."""
 ALONE = 0.5
 """... and no correction of other runs explains this share of what the best one explains."""
 SAME_MM = 0.5
@@ -33,7 +33,7 @@ CLEAR = 60.0
 
 @dataclass(frozen=True)
 class MixedUp:
-    """Runs with the wrong readings, what was done to them (``how``), and the share of the campaign's misfit that remains put right."""
+    """Runs with wrong readings, the kind of mistake (``how``), and the share of the campaign's misfit that remains after its correction."""
 
     runs: tuple[str, ...]
     how: str
@@ -62,7 +62,7 @@ def mixed_up(problem: WhitenedProblem) -> MixedUp | None:
 
 
 def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]]:
-    """Yield runs, what is the matter with them, and the change of all stacked readings, mm, that puts them right."""
+    """Yield runs, their supposed mistake, and the change of all stacked readings, mm, that corrects it."""
     ends = np.cumsum(problem.lengths)
     at = [slice(end - n, end) for n, end in zip(problem.lengths, ends, strict=True)]
     read = [r.data().deviation_mm for r in problem.runs]

@@ -342,7 +342,7 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
 def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
     """Standard uncertainty, s, of the moment at which pick ``i`` begins: a quarter of the times that explain nearly as much (`UNSURE`).
 
-    A step in time has no derivative, so the fit tells no uncertainty.
+    A step in time has no derivative, so the fit gives no uncertainty.
     """
     rows, pick = others(problem, picks, i), picks[i]
     times = np.array([*moments(problem.paths), pick.values["t0_s"]])

@@ -28,7 +28,7 @@ AIR_PER_K = -0.93e-6
 """Relative error of a laser reading per kelvin, 1/K: warm air is thin, so the laser reads short. It is dn/dT at 20 degree C, 101325 Pa and
 constant vapour pressure; at constant relative humidity it is -0.96e-6 (Edlen equation by Birch and Downs, Metrologia 30 (1993) 155)."""
 CAMPAIGN_S = (600.0, 12000.0)
-"""Range of time constants, s, that a campaign of hours can tell from a constant and from a straight line."""
+"""Range of time constants, s, that a campaign of hours can separate from a constant and from a straight line."""
 
 VISITED = (2.0 / 3.0) ** 2 / 3.0
 """Mean square of the position x (-1 .. +1 over the stroke) in the middle two thirds, where tests go. The form x^2 - VISITED has mean zero
@@ -145,7 +145,7 @@ def commanded_turns(at: Places, axis: int) -> tuple[F1, F1]:
 
 
 def wind_up(at: Places, axis: int, *over_mm: float) -> list[F1]:
-    """Return the signed share of the lost motion not yet taken up while the drive winds up after a reversal, one column per length."""
+    """Return the signed share of the lost motion that remains while the drive winds up after a reversal, one column per length."""
     sign, since = commanded_turns(at, axis)
     return [np.asarray(sign * np.exp(-since / length)) for length in over_mm]
 

@@ -93,7 +93,7 @@ class Effect:
     beside : tuple of str
         Names of the effects beside which alone this one is tried, at the same key.
     separated_by : dict
-        From a rival (name, or name:key) to the tests that tell the two apart (``next_test.adds``).
+        Maps a rival (name, or name:key) to the tests that separate the two (``next_test.adds``).
     """
 
     name: str

@@ -54,7 +54,7 @@ def standstill(runs: Sequence[StandstillRun]) -> Standstill:
         There are fewer than `LEAST_RUNS` runs.
     """
     if len(runs) < LEAST_RUNS:
-        raise ValueError(f"{len(runs)} runs at standstill, expected {LEAST_RUNS} or more: fewer do not tell heat from time")
+        raise ValueError(f"{len(runs)} runs at standstill, expected {LEAST_RUNS} or more: fewer do not separate heat from time")
     series = [Series(runs, since_start=way) for way in (False, True)]
     absolute, since_start = (one.response() for one in series)
     judged = [_left_out(one) for one in series]

@@ -242,10 +242,10 @@ class Series:
 
 
 def shift_of(series: Series, kept: Sequence[int], fit: Fit) -> Shift | None:
-    """The most significant offset of two or more neighbouring runs, not from the first on; None if chance explains it.
+    """The most significant offset of two or more neighbouring runs, the first two excluded; None if chance explains it.
 
-    Each place is tried with several scatters from run to run, the best one with all noise fitted anew: noise that was fitted without a
-    shift has taken it up. The p-value is multiplied by the number of places.
+    Each place is tried with several scatters from run to run. At the best place all noise is fitted again, because a fit without a shift
+    counts the shift as noise. The p-value is multiplied by the number of places.
     """
     places = [Shift(first, last, 0.0, 0.0, 1.0) for first, last in combinations(list(kept)[2:], 2)]
     tried = []

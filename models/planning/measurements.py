@@ -39,7 +39,7 @@ EDGES = (0.1, 0.5, 0.9)
 """Positions of laser lines on the two other axes, as fractions of the stroke."""
 ORDERS = tuple("".join(p) for p in permutations("XYZ"))
 SHORTEST_TOOL_MM = 1.0
-"""A shorter tool vector does not tell on which side of the cup the spindle is."""
+"""A shorter tool vector leaves open on which side of the cup the spindle is."""
 OBLIQUE = 0.5
 """From this ratio of the tool's second longest to its longest component, the spindle's direction is doubtful."""
 

@@ -1,5 +1,5 @@
 """What goes wrong when an artefact is measured: exchanged features, a pose that is a quarter turn off, an artefact that moved, a false
-trigger, a wrong radius, a part that twists. Each is named, and undone where the readings tell how."""
+trigger, a wrong radius, a part that twists. Each is named, and corrected where the readings determine the correction."""
 
 from __future__ import annotations
 

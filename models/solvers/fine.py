@@ -1,9 +1,9 @@
-"""Fine structure of a machine's motions in points of artefacts: pitch errors of screws, and what changes from one position to the next.
+"""Fine structure of a machine's motions in points of artefacts: pitch errors of screws, and errors that change from position to position.
 
-Polynomials cannot follow it, and an artefact has too few points for its course. What changes from one position to the next is a value of
-its own at each position of an axis (`abbe.models.solvers.artefact.Fine`), which at other positions counts as uncertainty. Periods are
-searched by the score of a sine and cosine on one axis, and on all axes together as screws of one lead cause. Every probable period takes
-part with a size by its probability: features stand at multiples of a pitch, so that often several explain the readings (aliases).
+Polynomials are too smooth for it, and an artefact has too few points to sample it. Errors that change from position to position get one
+unknown per position of an axis (`abbe.models.solvers.artefact.Fine`); at other positions they count as uncertainty. Periods are searched by
+the score of a sine and cosine, on each axis and on all axes together (screws of one lead). Every probable period enters the model with a
+size weighted by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases).
 """
 
 from __future__ import annotations
@@ -168,7 +168,7 @@ def _evidence(explained: F1, count: F1) -> F1:
 
 
 def _prior(frequencies: F1, span_mm: float) -> F1:
-    """Prior probability of every searched frequency: a usual lead, as well as positions over a span tell it, or any."""
+    """Prior probability of every searched frequency: a usual lead, within the resolution of the positions, or any."""
     near = np.abs(frequencies[:, None] - 1.0 / np.array(LEADS_MM)) < 0.5 / span_mm
     usual = (near / np.maximum(near.sum(axis=0), 1)).sum(axis=1) / len(LEADS_MM)
     return np.asarray((1.0 - SMOOTH) * (USUAL * usual + (1.0 - USUAL) / frequencies.size))

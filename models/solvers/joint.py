@@ -141,7 +141,7 @@ T = TypeVar("T")
 
 
 def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatenate[JointSolution, Q], T]:
-    """Cache the results of a function of a solution and hashable values as long as the solution exists.
+    """Cache a function of a solution and hashable arguments; its results live as long as the solution.
 
     The results must not refer to the solution, or it would never be freed.
     """

@@ -141,7 +141,7 @@ def smooth_shapes(order: int, length: float, ends: float = ENDS_SHARES[0]) -> tu
 
     The coefficients are those of a stationary process with Matern 3/2 correlation of about ``length`` strokes, log-normal with
     `LENGTH_SPREAD`, and with the share ``ends`` of its variance in independent coefficients, which are largest at the ends. A smoother
-    correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would then tell its ends. The shapes are
+    correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would determine its ends. The shapes are
     the eigenvectors of the coefficients' covariance.
 
     Returns
@@ -230,7 +230,7 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
     """Build the size model of the machine's ``terms`` and of the other unknowns ``rest`` (backlash and set-up, by name), in this order.
 
     Each class shares one size: positioning errors of order 2 and more, straightness errors, angles, slopes of angles, rough parts, lost
-    motions, cups and so on. The data on some members thus tell how large the others may be, and each error motion may differ from its
+    motions, cups and so on. Data on some members thus limit the size of the others, and each error motion may differ from its
     class. How sizes fall with the order is learned for all motions together and for each. Scales and squareness errors keep their
     documented size: an error common to all scales (temperature) does not show in their differences. All numbers are bounded, so that no
     data make a size grow with the order, or beyond what machines have.

@@ -21,7 +21,7 @@ from abbe.models.solvers.observe import run_design
 from abbe.models.solvers.priors import Priors
 
 SHORTEST_MM, LONGEST_MM = 4.0, 26.0
-"""Periods that are looked for: leads of screws. Longer ones are hardly told from the rest of what is rough."""
+"""Periods that are looked for: leads of screws. Longer ones can hardly be separated from the other roughness."""
 LEAST_GAIN = 45.0
 """Least gain in chi squared of a period (two more parameters): the best of 10,000 by chance reaches about 30."""
 RIVAL = 0.5
@@ -93,7 +93,7 @@ def rough_motions(solution: JointSolution) -> tuple[RoughMotion, ...]:
 
 
 def rough_lines(solution: JointSolution) -> tuple[str, ...]:
-    """What is rough, in sentences: periods, motions, or only the size if the readings do not tell which motions it concerns."""
+    """Roughness as sentences: periods, motions, or only the size if the readings cannot assign it to motions."""
     rough = any(t.order > SMOOTH_ORDER for t in solution.terms)
     if not rough and not any(test.flagged for test in solution.residual_tests):
         return ()
@@ -102,7 +102,7 @@ def rough_lines(solution: JointSolution) -> tuple[str, ...]:
         return known
     size = 1e3 * Priors().rough_mm * solution.size_factors["rough"]
     return (
-        f"translational error motions are rough, each by about {size:.1f} µm; these readings do not tell which of them at which places",
+        f"translational error motions are rough, each by about {size:.1f} µm; these readings do not show which of them at which places",
     )
 
 

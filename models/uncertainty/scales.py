@@ -1,4 +1,4 @@
-"""What a solution knows without the scales of the axes, where nothing that was measured tells them.
+"""A solution without the scales of the axes, for runs that do not determine them.
 
 A ball-bar of unknown length cannot tell a common scale from its own length, and a laser along diagonals cannot tell the scales of the axes
 from the tilt of its mirror. Everything else may be known well. So the best-fit scale over the volume is projected out of the coefficients,

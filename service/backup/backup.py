@@ -209,7 +209,7 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     Parameters
     ----------
     with_key : bool
-        Include the audit's key. Without it, whoever holds the backup cannot forge an audit, and `restore` asks for the key.
+        Include the audit's key. Without it, a holder of the backup cannot forge an audit, and `restore` asks for the key.
 
     Returns
     -------
@@ -233,7 +233,7 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
         sync_file(target.parent)
     except OSError as err:
         raise BackupRefused(
-            f"{target} could not be written: {err.strerror}", "look at disk space and rights; no part of it was left"
+            f"{target} could not be written: {err.strerror}", "check disk space and rights; the partial backup was removed"
         ) from err
     finally:
         shutil.rmtree(part, ignore_errors=True)

@@ -106,7 +106,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
     targets = _Targets(database, segment_folder(into.url, into.capture), *files_of(sqlite_base(database)))
     existing = targets.existing()
     if existing and not replace:
-        raise BackupRefused(f"{existing[0]} exists", "give --replace to put what is there aside, or another --db")
+        raise BackupRefused(f"{existing[0]} exists", "add --replace to set the existing files aside, or give another --db")
     return targets
 
 

@@ -30,7 +30,7 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
 
 
 def _unobservable(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
-    """Tell what the decimated runs cannot show, one sentence each.
+    """Return limits of the decimated runs, one sentence each.
 
     ``each``: readings per value; ``interval_s``: time between values; ``turning``: number of values in whose readings an axis reverses.
     """

@@ -109,7 +109,7 @@ def _laser(test: str, setup: LaserSetup, points: F2) -> GeometryMistake | None:
 def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None:
     """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     if test == "laser_linear" and setup.axis and not span.any():
-        stood = "the axis stood still: readings over time tell no geometry, only a report shows them"
+        stood = "the axis stood still: readings over time show no geometry, only a report shows them"
         remedy = "leave the run out (--without); such runs alone, with temperatures, show the thermal response (abbe discover)"
         return GeometryMistake(stood, remedy)
     unit = span / max(float(np.linalg.norm(span)), 1e-9)

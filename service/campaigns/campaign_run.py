@@ -72,7 +72,8 @@ class BarBreaks:
         await self._control.unless_stopped(self._bar.make_ready(within_s=self._suspending.longest_s))
         runner.touched = True
         raise RunInterrupted(
-            f"the ball-bar's box was lost and is back ({error.code})", "the test begins again; its readings are kept as evidence"
+            f"the link to the ball-bar's box was lost and restored ({error.code})",
+            "the test begins again; its readings are kept as evidence",
         ) from error
 
 

@@ -1,4 +1,4 @@
-"""Plans the poses of an artefact for the minutes at hand: each next one tells the most, and all touches stay inside the strokes.
+"""Plans the poses of an artefact for the minutes at hand: each pose adds the most information, and all touches stay inside the strokes.
 
 The artefact file is TOML with one table ``[artefact.NAME]``, as at the end of a recipe.
 """

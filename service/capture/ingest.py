@@ -144,7 +144,7 @@ class Ingest:
         try:
             found = decode_at(os.pread(self._file, length, offset), 0)
         except OSError as error:
-            raise CaptureFault(f"the segment cannot be read back: {error.strerror}", "look at the disk") from error
+            raise CaptureFault(f"the segment cannot be read back: {error.strerror}", "check the disk") from error
         if found is None:
             raise CaptureFault("the segment does not read back as it was written", "look at the disk")
         return found[0]

@@ -264,7 +264,8 @@ class _Tap:
 class CaptureRecorder:
     """Records one run. Open it with `recording`.
 
-    ``behind``: whether the segment has records that the database lacks. If so at the end, it stays, and the next start recovers the run.
+    ``behind``: whether the segment has records that the database lacks. A segment that is still behind at the end is kept: the next start
+    recovers the run from it.
     """
 
     def __init__(self, log: CaptureLog, ingest: Ingest, keep: bool, io: FileIO, *, temporary: bool = False) -> None:
@@ -282,7 +283,7 @@ class CaptureRecorder:
         return _Tap(self.log, self._streams - 1, self.look)
 
     async def add_bar(self, batch: BarBatch) -> None:
-        """Check the capture after a batch that the tap has taken; raises like `check`."""
+        """Check the capture after a batch of the ball-bar; the tap has queued its samples. Raises like `check`."""
         self.check()
 
     async def add_record(self, record: dict[str, Any]) -> None:

@@ -216,7 +216,7 @@ def answer(doc: Any, *lines: str, as_json: bool) -> None:
 
 
 def conclude(then: str, *, machine: Path | None = None, db: str | None = None, verdict: str = "", as_json: bool = False) -> None:
-    """Tell people the verdict and the next command, on stderr: stdout holds the answer alone. With ``as_json``, tell nothing.
+    """Print the verdict and the next command on stderr: stdout holds only the answer. With ``as_json``, print nothing.
 
     ``machine`` and ``db``, as they were given, are repeated in the next command.
     """

@@ -1,4 +1,4 @@
-"""`abbe plan` chooses the measurements that tell most in the available minutes, and writes them as a recipe for `abbe measure`."""
+"""`abbe plan` chooses the most informative measurements for the available minutes, and writes them as a recipe for `abbe measure`."""
 
 from __future__ import annotations
 
@@ -117,7 +117,7 @@ def _print(planned: PlannedCampaign, out: Path | None, picture: Path | None) -> 
         typer.echo(f"note: {line}")
     for line in goal_lines(planned.plan):
         typer.echo(line)
-    typer.echo("this campaign cannot tell:")
+    typer.echo("this campaign cannot determine:")
     for text in planned.plan.open_questions:
         typer.echo(f"- {text}")
     if picture is not None:

@@ -200,7 +200,7 @@ async def console_ask(text: str) -> None:
     Raises
     ------
     ConfigError
-        No one is at the console (standard input is closed or not a terminal).
+        No person is at the console (standard input is closed or not a terminal).
     """
     import termios  # here: a platform without termios still plans and reads
 

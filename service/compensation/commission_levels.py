@@ -1,7 +1,7 @@
 """Commissioning of a controller's capabilities: each flag is proved by attempts that it must refuse and attempts that it must accept.
 
 The inactive bank holds a copy of the table in force for every attempt. So the same corrections act as before, whatever the controller
-wrongly accepts and wherever the test is interrupted. Nobody has to open, press or restart anything; what only such an action
+wrongly accepts and wherever the test is interrupted. No person has to open, press or restart anything; what only such an action
 could show is reported as not shown.
 
 `Trial` attempts one operation and records whether it was refused. `while_moving` checks that an activation is refused while an axis moves:
@@ -96,7 +96,7 @@ class Trial:
         return bool(of_it) and all(of_it)
 
     async def status(self) -> CompStatus:
-        """Return the present state of the banks; also note the boot id."""
+        """Return the present state of the banks; record its boot id."""
         now = await self.controller.comp_status()
         self.boots.add(now.boot_id)
         return now
@@ -263,7 +263,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
     info = await controller.identify()
     if has_one_table(controller):
         raise TableRefused(
-            "this control has one table, not two banks: while tables are exchanged nothing acts, and no other program may write",
+            "this control has one table, not two banks: during an exchange no table is in force, and no other program may write",
             "if that is acceptable, commission that lower level by name: abbe comp commission --one-bank",
         )
     base = await read_base(controller)

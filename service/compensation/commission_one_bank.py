@@ -88,5 +88,5 @@ async def _on_again(t: Trial, control: OneBank) -> None:
             raise TableMismatch(f"compensation is off and cannot be switched on: {error.detail}", "look at the control") from error
     found = await read_base(t.controller)
     if found.image != t.base.image:
-        raise TableMismatch("another table acts than before the test", "look at the control")
+        raise TableMismatch("the table in force differs from the one before the test", "look at the control")
     t.shown.append(FlagObservation(FLAG, True, "acts with the same table afterwards"))

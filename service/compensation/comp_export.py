@@ -85,7 +85,7 @@ def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identifie
     if without_scale:
         scales = scales_badly_known(doc)
         if scales is None:
-            raise FormatRefused("this solution knows the scales no worse than the rest", "export it without --without-scale")
+            raise FormatRefused("this solution determines the scales as well as the rest", "export it without --without-scale")
         coefficients = scale_projection(machine, terms, scales) @ coefficients
     return Identified(machine, terms, coefficients, observed)
 
@@ -100,7 +100,7 @@ def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
     rest = f"the rest is known to ± {u['without_scale']['expanded_vector_um']:.2g} µm at the worst"
     if without_scale:
         return [f"{text}: left out, and not corrected; {rest}"]
-    return [f"{text}: written, but these runs hardly tell: ± {worst:.2g} µm with it, {rest}: --without-scale leaves it out"]
+    return [f"{text}: written, but poorly determined by these runs: ± {worst:.2g} µm with it, {rest}: --without-scale leaves it out"]
 
 
 def reach_note(doc: dict[str, Any]) -> list[str]:
@@ -197,7 +197,7 @@ def sign_is_turned(step_moved_um: float | None) -> bool | None:
         return None
     if not abs(abs(step_moved_um) - STEP_UM) <= STEP_SHARE * STEP_UM:
         raise FormatRefused(
-            f"the step moved the axis by {step_moved_um:g} µm, neither -10 nor +10: axis, unit or scale are not as we write them",
+            f"the step moved the axis by {step_moved_um:g} µm, neither -10 nor +10: axis, unit or scale differ from the file",
             "load no table; compare the file with one that the control exports",
         )
     return step_moved_um > 0.0
@@ -362,7 +362,7 @@ def formats_in(control: ControlModel) -> tuple[str, ...]:
 
 
 def write_files(files: tuple[TextFile, ...], out: Path, *, folder: bool = False) -> list[Path]:
-    """Write one file to ``out``, or several (with ``folder`` also one) into a new folder ``out``. After an error there is no folder.
+    """Write one file to ``out``; several files, or any with ``folder``, into a new folder ``out``. An error leaves no folder.
 
     Raises
     ------
@@ -405,7 +405,7 @@ def read_files(path: Path) -> tuple[TextFile, ...]:
         for p in paths:
             out.append(TextFile(p.name, io.StringIO(read_plain(p, LARGEST_FILE).decode("utf-8"), None).read()))
     except NotPlainError as error:
-        raise FileFormatError(f"{error.filename}: {error.strerror}: no compensation table", "give the table's file") from None
+        raise FileFormatError(f"{error.filename} is not a compensation table: {error.strerror}", "give the table's file") from None
     except OSError as error:
         raise FileFormatError(f"{path}: cannot be read: {error.strerror}", "give a file or a folder") from None
     except UnicodeDecodeError:

@@ -51,7 +51,7 @@ class ControlFolder:
 
     def __init__(self, path: Path) -> None:
         if not path.is_dir():
-            raise FileFormatError(f"{path}: is no folder", "mount the control's folder or medium")
+            raise FileFormatError(f"{path}: is not a folder", "mount the control's folder or medium")
         self.name, self._path = str(path.resolve()), path
 
     def get(self, name: str) -> bytes | None:
@@ -143,7 +143,7 @@ def drop(source: Path, to: Place, *, machine: str, form: str, now: datetime) -> 
 
 
 def take_back(source: Path) -> Drop:
-    """Put the files that lay there before into their place again; files that somebody changed since are left alone.
+    """Restore the previous files; leave files alone that were changed since.
 
     Raises
     ------
@@ -178,7 +178,7 @@ def confirm(source: Path, back: Path, settings: FormatSettings, *, turned: bool 
     made = _lying_there(source)
     if back.resolve() in (source.resolve(), Path(made.folder)):
         raise FileFormatError(
-            f"{back}: these are the files that were dropped, not what the control wrote", "export the tables at the control"
+            f"{back}: these are the dropped files, not files that the control exported", "export the tables at the control"
         )
     given, found = (read_key(made.form, read_files(p), settings, turned=turned) for p in (source, back))
     check_same(found, given, alike_mm(control_for(made.form)))
@@ -213,7 +213,7 @@ def receipt(source: Path) -> Drop:
     except OSError:
         raise FileFormatError(f"{file}: there is no receipt", "drop the files first: abbe comp drop") from None
     except (ValueError, KeyError, TypeError, AttributeError):
-        raise FileFormatError(f"{file}: is no receipt of {FORMAT}", "restore it from a backup") from None
+        raise FileFormatError(f"{file}: is not a receipt of {FORMAT}", "restore it from a backup") from None
 
 
 def _lying_there(source: Path) -> Drop:

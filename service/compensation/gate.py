@@ -268,5 +268,5 @@ def check_promise(predicted: Predicted, limits: PushLimits) -> None:
         return
     gain_mm = predicted.before_mm - predicted.after_mm
     if predicted.u_model_mm > limits.share * predicted.before_mm or gain_mm >= limits.gain * predicted.before_mm:
-        raise TableRefused(no, "these runs know the errors too poorly: measure more (`abbe plan`); nothing was written")
-    raise TableRefused(no, "tables of this kind take out no more: `abbe solve --tables` shows what other kinds could; nothing was written")
+        raise TableRefused(no, "these runs determine the errors too poorly: measure more (`abbe plan`); nothing was written")
+    raise TableRefused(no, "tables of this kind remove no more: `abbe solve --tables` compares the kinds; nothing was written")

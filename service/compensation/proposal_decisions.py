@@ -164,7 +164,7 @@ def reject(store: Store, number: int, name: str, reason: str, clock: Clock, acco
     """
     check_waiting(store, number, load(store, number), clock.utc().timestamp())
     if not reason.strip():
-        raise TableRefused(f"proposal {number} cannot be rejected without a reason", "say why; the proposer has to know")
+        raise TableRefused(f"proposal {number} cannot be rejected without a reason", "give the reason, for the proposer")
     store.proposals.reject(ProposalRejection(proposal_id=number, name=name, login=account or login(), reason=reason.strip()))
     return store.proposals.rejections(number)[-1]
 

@@ -262,11 +262,11 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
     Raises
     ------
     TableRefused
-        The readings cannot carry the map, artefacts span a volume, or (``without_scale``) the scales are not what they know worst.
+        The readings do not support the map, the artefacts span a volume, or (``without_scale``) the scales are not the least certain.
     """
     solved = solve_runs(site, runs)
     if not only_artefacts(solved.joint) and (beyond := beyond_the_prior(solved.joint)):
-        raise TableRefused(f"no tables from a map that the readings cannot carry: {beyond.what}", f"{beyond.remedy}; nothing was written")
+        raise TableRefused(f"the readings do not support tables: {beyond.what}", f"{beyond.remedy}; nothing was written")
     change, predicted, left_out = change_of(solved, without_scale=without_scale)
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted, left_out)
 
@@ -281,7 +281,7 @@ def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTable
     free = scale_free(assess(solved))
     sources, text = free.sources, SCALE_TEXTS[free.left_out or "common"]
     change = nine_tables(sources.solution, GRID, sources=sources)
-    return change, predict_residual(sources.solution, change, sources=sources), (f"{text}, which the runs hardly tell: left out",)
+    return change, predict_residual(sources.solution, change, sources=sources), (f"{text}, poorly determined by the runs: left out",)
 
 
 def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, ...]]:
@@ -290,14 +290,14 @@ def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, 
     Raises
     ------
     TableRefused
-        The solution put a fault right that nobody looked at, or all three directions were sensed.
+        The solution corrected a fault of the set-up without review, or all three directions were sensed.
     """
     joint = solved.joint
     if solved.undone:
         fault = solved.undone[0]
         raise TableRefused(f"run {fault.run}: {fault.what} ({fault.done})", "look at the artefact and measure that pose again")
     if unsensed_axis(joint) is None:
-        raise TableRefused("these artefacts span a volume: one-axis tables are made of one plane", "make a grid: abbe solve --tables")
+        raise TableRefused("these artefacts span a volume: one-axis tables need artefacts in one plane", "make a grid: abbe solve --tables")
     frame: list[str] = []
 
     def known(points: F2) -> tuple[F2, F2]:
@@ -411,5 +411,5 @@ def check_before_runs(site: Site, base: Base, runs: list[Run], since_s: float, n
         )  # fmt: skip
         if why:
             raise TableRefused(
-                f"nothing can be compared with run {run.run_id}: it {why}", "measure the verification before again; nothing was written"
+                f"run {run.run_id} is no basis for a comparison: it {why}", "repeat the first verification; nothing was written"
             )

@@ -331,7 +331,7 @@ class Pushing:
                 raise operator_needed(ended.journal, detail) from self._error
             case PushState.ROLLBACK_PENDING:
                 raise StillActive(f"{detail}; {STILL_ACTIVE} ({known.pending})", MAKE_READY) from self._error
-        raise PushNotBegun(f"the table was not brought into force: {why}", "the old table is in force; look at the cause, then push again")
+        raise PushNotBegun(f"the table was not brought into force: {why}", "the old table is in force; remove the cause, then push again")
 
 
 def _image(wanted: WantedTable | RestoredTable) -> tuple[bytes, str]:

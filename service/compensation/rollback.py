@@ -115,7 +115,7 @@ async def rollback(
     pushing = Pushing(controller, store, site, control=Control() if request is None else request.control)
     pushed = await pushing.bring(RestoredTable(wanted.image, wanted.semantic_digest, base, doc), questions)
     if not pushed.kept:
-        raise TableRefused(f"the rollback failed: {pushed.why}", "the table from before it is in force; look at the cause, then try again")
+        raise TableRefused(f"the rollback failed: {pushed.why}", "the previous table stays in force; remove the cause, then try again")
     return RollbackResult(pushed, wanted.how)
 
 

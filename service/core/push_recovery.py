@@ -42,7 +42,7 @@ IsOpen = Callable[[], Awaitable[bool]]
 
 
 class PushRecovery:
-    """Tries until nothing is open, and starts again when a push is left open.
+    """Tries until nothing is open, and starts again when a push ends unfinished.
 
     Parameters
     ----------
@@ -104,7 +104,7 @@ class PushRecovery:
         finally:
             self._claim.give_back()
         if done:
-            log.warning("recovery done: what was left open is closed", what=done)
+            log.warning("recovery done: open pushes are closed", what=done)
         self._show(None)
         return True
 
@@ -115,7 +115,7 @@ class PushRecovery:
             return
         self._show(text)
         known = asdict(cause)
-        log.error("recovery failed: what was left open cannot be closed", **known)
+        log.error("recovery failed: open pushes remain open", **known)
         await self._alarms.alarm({**known, "at_utc": self._clock.utc().isoformat()})
 
     def _show(self, text: str | None) -> None:

@@ -56,7 +56,7 @@ class ServiceSetup:
     recipes : tuple of str
         Recipes that a person may start at any time, besides those of the timetable.
     recover : callable, optional
-        Given the store, returns the recovery of what an earlier process left open.
+        Given the store, returns the recovery of runs and pushes that an earlier process left unfinished.
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional

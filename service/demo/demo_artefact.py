@@ -2,7 +2,7 @@
 
 measure in four poses -> measure a fifth one (before) -> solve -> tables of this plane -> push -> the fifth pose again (after) -> keep
 or roll back; then the sealed truth of the simulator. Nobody knows the plate beyond one length. The ball-bar only proves sign and unit of
-the tables (`abbe comp commission`), the laser only tells the temperature.
+the tables (`abbe comp commission`), the laser only measures the temperature.
 """
 
 from __future__ import annotations
@@ -140,7 +140,7 @@ def artefact_report(result: DemoResult) -> Document:
     before, after = (plain(t.plane_rms_um) for t in result.truths)
     rows.append(("sealed truth, rms in the plane", before, "", after, ""))
     table = TextTable(("figure, µm", "before", "U (95 %)", "after", "U (95 %)"), tuple(rows))
-    told = Section("What these poses tell", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
+    told = Section("Results of these poses", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
     sections = (Section("Before and after", [c.decision.text, table]), told)
     title = f"Simulated machine {result.seed}, measured by its own probe"
     return Document(kind="cycle", title=title, sections=sections, signatures=())

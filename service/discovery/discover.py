@@ -85,14 +85,14 @@ class DiscoveryJob:
 
 
 def _without_artefacts(campaign: Campaign) -> tuple[Campaign, list[str]]:
-    """Leave out points of artefacts: what moves with a part, and what stays with the machine, is named by a solution of its poses."""
+    """Leave out points of artefacts: a solution of the poses separates errors of the part from those of the machine."""
     artefacts = [r.run_id for r in campaign.runs if r.is_artefact]
     if not artefacts:
         return campaign, []
     if len(artefacts) == len(campaign.runs):
         raise NotObservable(
             f"campaign {campaign.name} has only points of artefacts, which the search does not read",
-            f"`abbe discover {campaign.name}` names what moves with the part and what stays with the machine, without a search",
+            f"`abbe discover {campaign.name}` separates errors of the part from errors of the machine, without a search",
         )
     return campaign.without(artefacts), [f"points of artefacts were left out of the search: {', '.join(artefacts)}"]
 

@@ -77,7 +77,7 @@ def not_entered(finding: Finding, judged: Judgement) -> str | None:
             return f"the holdout runs do not need {e.label}"
         near = next((rival for rival in e.alternatives if rival.less_evidence < NEAR), None)
         if near is not None:
-            return f"these runs hardly tell {e.label} from {near.label}"
+            return f"these runs hardly separate {e.label} from {near.label}"
     return None
 
 

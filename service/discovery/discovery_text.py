@@ -85,7 +85,7 @@ def _remainder_text(finding: Finding) -> str:
 
 
 def _proof_text(judged: Judgement) -> str:
-    """Tell how far the gap closed on the holdout runs."""
+    """Return how far the gap closed on the holdout runs, as text."""
     assert judged.gap is not None  # a proof needs a gap
     return f"also on runs that were never fitted, {_judging_text(judged.gap)}"
 
@@ -148,7 +148,7 @@ def lines_of(finding: Finding) -> list[str]:
 
 
 def book_lines(finding: Finding) -> list[str]:
-    """Tell why the named effects stay out of the model book; empty if they enter it."""
+    """Return why the named effects stay out of the model book; empty if they enter it."""
     why = not_entered(finding, judge(finding)) if finding.effects else None
     return [] if why is None else [f"not added to the model book: {why}"]
 
@@ -196,7 +196,7 @@ def _times(less: float) -> str:
 
 
 def next_of(finding: Finding) -> list[str]:
-    """Tell what to measure next: a test that separates the suspects, else general advice."""
+    """Return the next measurement as text: a test that separates the suspects, else general advice."""
     if finding.doubt:
         without = " ".join(f"--without {run}" for run in finding.location.runs)
         return [f"do next: correct the files, or search without these runs: abbe discover {finding.case} {without}"]

@@ -22,7 +22,7 @@ COVERAGE = 2.0
 
 
 def drift_text(store: Store, made: StoredProposal) -> str:
-    """Tell which linear error changed most since the previous solution, with U; without a previous one, which is largest.
+    """Return the linear error that changed most since the previous solution, with U; without a previous one, the largest.
 
     ``made``: proposal with the new solution. Empty if no linear error is known. Only solutions measured with the same compensation table
     are compared. Uncertainty that both share (the laser's wavelength) counts twice in U.

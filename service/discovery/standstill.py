@@ -34,7 +34,7 @@ class Judged:
 
 @dataclass(frozen=True, eq=False)
 class StandstillAnswer:
-    """What the runs of a campaign tell. ``runs``: labels of those that were fitted, in order of time; ``judged``: all others."""
+    """Results of the runs of a campaign. ``runs``: labels of those that were fitted, in order of time; ``judged``: all others."""
 
     campaign: str
     runs: tuple[str, ...]

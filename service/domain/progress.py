@@ -79,7 +79,7 @@ class RecordedPath:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceStatus:
-    """State of a device of the machine file, and when it last answered. Between checks nobody polls the device."""
+    """State of a device of the machine file, and the time of its last answer. The device is not polled between checks."""
 
     role: Word
     url: Text

@@ -31,15 +31,15 @@ def only_artefacts(joint: JointSolution) -> bool:
 
 
 def artefact_lines(joint: JointSolution) -> list[str]:
-    """Return what the poses of an artefact hide and which pose would tell it, its share of the named fields, and the plain fit of every
-    workpiece alone."""
+    """Return the errors that the poses of an artefact hide, the pose that would show them, their share of the named fields, and a separate
+    rigid fit of every workpiece."""
     rank = pose_rank(joint.data)
     told = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
     return told + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
 
 
 def without_length(joint: JointSolution) -> bool:
-    """Whether nothing tells the scale: probed artefacts only, none with a calibrated length."""
+    """Whether the scale is undetermined: probed artefacts only, none with a calibrated length."""
     return all(run.points is not None and run.points.source == "probe" for run in joint.data)
 
 

@@ -29,7 +29,7 @@ class RemovedEffects:
     ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
     used; ``version``: of the book, None without one; ``in_force``: the active table whose side effects were subtracted
     (`abbe.service.identification.table_removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
-    in the readings, which the assessment of a solution has to be told, empty otherwise.
+    in the readings, which the assessment of a solution needs, empty otherwise.
     """
 
     campaign: Campaign

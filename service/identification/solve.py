@@ -69,7 +69,7 @@ class Solved:
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
     temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs,
     beyond which the map is the prior's. ``inputs``: stated uncertainties that no reading shows.
-    ``undone``: faults of runs of artefacts (exchanged features, a turn, a motion) that the solution has put right by itself.
+    ``undone``: faults of runs of artefacts (exchanged features, a turn, a motion) that the solution corrected by itself.
     """
 
     joint: JointSolution

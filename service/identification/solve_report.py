@@ -219,7 +219,7 @@ def scale_text(found: Assessment) -> str:
     if free is None or free.left_out is None:
         return ""
     error, largest = _error_rms_mm(free.prediction) * 1e3, float(free.prediction.expanded_vector_mm.max()) * 1e3
-    return f"; without {SCALE_TEXTS[free.left_out]}, which these runs hardly tell, {error:.2g} µm rms known to ± {largest:.2g} µm"
+    return f"; without {SCALE_TEXTS[free.left_out]}, poorly determined by these runs, {error:.2g} µm rms known to ± {largest:.2g} µm"
 
 
 def _error_rms_mm(prediction: Prediction) -> float:
@@ -234,7 +234,7 @@ def model_key(joint: JointSolution) -> str:
 
 
 def not_observable(found: Assessment) -> list[str]:
-    """Tell what the runs cannot separate, why, and which measurement would."""
+    """Return errors that the runs cannot separate, the reason, and the measurement that would."""
     return [g.text for g in found.observability.hidden]
 
 

@@ -80,9 +80,7 @@ def scale_free(found: Assessment) -> Assessment:
         The scales are not what the runs know worst.
     """
     if found.scale_free is None:
-        raise TableRefused(
-            "these runs know the scales no worse than the rest, so there is nothing to leave out", "run again without --without-scale"
-        )
+        raise TableRefused("these runs determine the scales as well as the rest: leave nothing out", "run again without --without-scale")
     return found.scale_free
 
 

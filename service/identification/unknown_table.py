@@ -1,4 +1,4 @@
-"""What a table that acted during a campaign, and that nobody has, may have done to the readings: its share of the uncertainty.
+"""Uncertainty from a table that was in force during a campaign and is not available.
 
 Smooth corrections of such a table need no knowledge: they belong to the machine as it was measured. What it did beyond them is bounded: an
 axis loses at most its lost motion of each move that the table makes, and straight lines between the table's points differ little from a

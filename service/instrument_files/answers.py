@@ -139,7 +139,7 @@ def _further(test: AxisReadings, axis: str, answers: Answers) -> dict[str, Any]:
 
 
 def unknown_of(test: AxisReadings) -> list[str]:
-    """What is not known of a test, as text for reports."""
+    """Unknown facts of a test, as text for reports."""
     out = []
     if f"temp_{test.axis.lower()}_C" not in test.further:
         out.append(f"temperature of the scale of {test.axis}: U assumes 15 to 25 °C")

@@ -63,7 +63,7 @@ def read_b5r(name: str, data: bytes) -> Content:
         features = [one for one in features if ANALYSIS in one.inside]
     stated = tuple(_figures(file, name, plane, features))
     if not stated:
-        raise file.wrong(last, "there is no FEATURE with a result: the file is cut off, or no .b5r")
+        raise file.wrong(last, "there is no FEATURE with a result: the file is cut off, or is not a .b5r file")
     left = sorted({kind for one in features if (kind := one.attributes.get("DT", "")) not in UNITS and kind not in NOT_FIGURES})
     notes = [f"data type {kind} is not known and was not read" for kind in left]
     notes.append("the trace (radius against angle) was not read: no public description says where it is")

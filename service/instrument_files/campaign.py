@@ -102,12 +102,12 @@ def _check_together(contents: Sequence[Content]) -> None:
     seen = dict[str, str]()
     for content in contents:
         if content.sha256 in seen:
-            raise FileFormatError(f"{content.name}: its bytes are those of {seen[content.sha256]}", "give every measurement once")
+            raise FileFormatError(f"{content.name}: it is a copy of {seen[content.sha256]}", "give every measurement once")
         seen[content.sha256] = content.name
     named = {content.machine: content.name for content in contents if content.machine}
     if len(named) > 1:
         told = ", ".join(f"{machine!r} ({file})" for machine, file in named.items())
-        raise FileFormatError(f"the files name different machines: {told}", "import the files of each machine by themselves")
+        raise FileFormatError(f"the files name different machines: {told}", "import the files of each machine separately")
 
 
 def _is_run(test: AxisReadings) -> bool:

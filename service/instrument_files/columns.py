@@ -146,7 +146,7 @@ def column_file(path: Path) -> ColumnFile:
     try:
         return ColumnFile.model_validate(tomllib.loads(read_bytes(path).decode("utf-8")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
-        raise FileFormatError(f"{path}: no TOML: {err}", "see docs/how-to/import.md") from None
+        raise FileFormatError(f"{path}: not valid TOML: {err}", "see docs/how-to/import.md") from None
     except ValidationError as err:
         first = mistakes(err.errors())[0]
         place = location_text(first.place)
@@ -171,7 +171,7 @@ def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None,
             try:
                 rows.append((line, text.split() if sign == " " else next(csv.reader([text], delimiter=sign, strict=True))))
             except csv.Error as err:
-                raise file.wrong(line, f"no row of a table: {err}") from None
+                raise file.wrong(line, f"not a row of a table: {err}") from None
         if len(rows) > MOST_ROWS:
             raise file.wrong(line, f"more than {MOST_ROWS} rows")
     if not rows:
@@ -201,7 +201,7 @@ def _excel(name: str, data: bytes, sheet: str | None) -> FileRows:
             raise file.wrong(1, f"there is no sheet {sheet!r}; there are {', '.join(names)}")
         cells = book.get_sheet_by_name(sheet or names[0]).to_python(skip_empty_area=False)
     except (CalamineError, IndexError) as err:
-        raise file.wrong(1, f"no Excel workbook: {' '.join(str(err).split())}", "save it again") from None
+        raise file.wrong(1, f"not an Excel workbook: {' '.join(str(err).split())}", "save it again") from None
     rows = [(k, [_text(cell) for cell in row]) for k, row in enumerate(cells, start=1)]
     rows = [(line, row) for line, row in rows if any(row)]
     if not rows or len(rows) > MOST_ROWS:
@@ -337,9 +337,9 @@ def _by_order(body: _ReadingRows, target: F1) -> F1:
     step = np.sign(np.diff(target))
     for k in range(1, step.size):
         if step[k] == 0.0 == step[k - 1]:
-            raise body.wrong(k + 1, f"target {target[k + 1]:g} mm three times in a row: the order does not say the direction")
+            raise body.wrong(k + 1, f"target {target[k + 1]:g} mm three times in a row: the order gives no direction")
     if not step.any():
-        raise body.wrong(0, "all targets are the same: the order does not say the direction")
+        raise body.wrong(0, "all targets are equal: the order gives no direction")
     # The first reading, and the second one at a turning point, belong to the way that follows.
     way = np.concatenate([[0.0], step])
     for k in reversed(range(way.size)):

@@ -27,7 +27,7 @@ def read_rtx(name: str, data: bytes) -> Content:
     """
     head, found, samples = data.partition(b"\r\n" + DATA)
     if not data.startswith(HEAD) or not found:
-        raise FileFormatError(f"{name}:1: no .rtx: it does not begin with HEADER:: or has no Data:", "export the file again")
+        raise FileFormatError(f"{name}:1: not an .rtx file: it does not begin with HEADER:: or has no Data:", "export the file again")
     file = text_file(name, head)
     facts, lines = _facts(file)
     count, rate = int(float(facts["sample no"])), float(facts["actual sample rate"])
@@ -57,12 +57,12 @@ def _facts(file: TextFile) -> tuple[dict[str, str], dict[str, int]]:
         key, colon, value = text.partition(":")
         name = " ".join(key.split()).lower()
         if not colon or name in lines:
-            raise file.wrong(line, f"{text[:40]!r} is no 'Key: value', or stands here a second time")
+            raise file.wrong(line, f"{text[:40]!r} is not 'Key: value', or is repeated")
         facts[name], lines[name] = value.strip(), line
     for name, least in (("sample no", 2.0), ("actual sample rate", 1e-9)):
         if name not in facts:
             raise file.wrong(line, f"{name!r} is missing")
         number = file.number(lines[name], facts[name], name.capitalize())
         if not least <= number <= MOST or (name == "sample no" and number % 1.0):
-            raise file.wrong(lines[name], f"{name.capitalize()} is {facts[name]}, expected a possible one")
+            raise file.wrong(lines[name], f"{name.capitalize()} is {facts[name]}, which is impossible")
     return facts, lines

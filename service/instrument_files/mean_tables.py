@@ -35,7 +35,7 @@ def read_pos(name: str, data: bytes) -> Content:
     file = text_file(name, data)
     tables, said, last = _pos_tables(file)
     if not tables:
-        raise file.wrong(last, "no table 'Position ... Avg Error': the file is cut off, or no .pos")
+        raise file.wrong(last, "no table 'Position ... Avg Error': the file is cut off, or is not a .pos file")
     ways = sorted(way for way in tables if way) or [0.0]
     if ways == [0.0, 1.0] or ways in ([1.0], [-1.0]):
         raise file.wrong(last, "the table of the other direction is missing: the file is cut off")
@@ -68,7 +68,7 @@ def _pos_tables(file: TextFile) -> tuple[dict[float, Table], dict[str, str], int
                 raise file.wrong(line, f"a second table of {head.group(1)} means")
             now = tables.setdefault(way, ([], [], [], []))
         elif _OTHER_HEAD.match(text):
-            raise file.wrong(line, f"{text.strip()[:60]!r} is no table that is known", "send the file to the people who write Abbe")
+            raise file.wrong(line, f"{text.strip()[:60]!r} is not a known table", "send the file to the people who write Abbe")
         elif now is not None and text.strip():
             _row(file, line, text, now)
         elif now is None and ":" in text:
@@ -126,7 +126,9 @@ def read_ren(name: str, data: bytes) -> Content:
             _ren_fact(file, line, text, facts, said)
             unit |= {_unit(found) for found in _UNITS.findall(text.partition(":")[2])} if "unit" in text.lower() else set()
     if not head or len(values) < 2 or len(facts) != len(_REN_FACTS):
-        raise file.wrong(line, "spacing, start, end or the table 'No. Axis position Combined' is missing: the file is cut off, or no .REN")
+        raise file.wrong(
+            line, "spacing, start, end or the table 'No. Axis position Combined' is missing: the file is cut off, or not a .REN"
+        )
     _check_spacing(file, line, facts, np.array(positions))
     known = len(unit) == 1
     factor = LENGTHS[next(iter(unit))] if known else 1.0
@@ -157,7 +159,7 @@ def _ren_fact(file: TextFile, line: int, text: str, facts: dict[str, float], sai
     if name is not None:
         numbers = re.findall(r"[-+]?[0-9]*\.?[0-9]+", text)
         if not numbers or name in facts:
-            raise file.wrong(line, f"the compensation's {name} has no number, or stands here a second time")
+            raise file.wrong(line, f"the compensation's {name} has no number, or is repeated")
         facts[name] = file.number(line, numbers[0], name)
     elif ":" in text:
         key, _, value = text.partition(":")

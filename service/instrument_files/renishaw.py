@@ -104,7 +104,7 @@ def _sections(file: TextFile) -> _Sections:
             now.append((line, text.strip()))
     for name in _NEEDED:
         if name not in out.at:
-            raise file.wrong(out.last, f"section {name}:: is missing: the file is cut off, or no .rtl or .rta")
+            raise file.wrong(out.last, f"section {name}:: is missing: the file is cut off, or is not an .rtl or .rta file")
     return out
 
 
@@ -139,7 +139,7 @@ def _targets(parts: _Sections) -> tuple[F1, bool]:
         name = " ".join(key.split()).lower()
         known = name in ("target-count", "targets", "flags") and name not in lines if colon else "targets" in lines and "flags" not in lines
         if not known and not (colon and name == "filetype"):
-            raise file.wrong(line, f"{text[:40]!r} is not known, or a second time, in TARGET DATA::")
+            raise file.wrong(line, f"{text[:40]!r} is unknown or repeated in TARGET DATA::")
         lines |= {name: (line, rest.strip())} if colon else {}
         if not colon or name == "targets":
             values += [file.number(line, word, "a target") for word in (rest if colon else text).split()]
@@ -150,7 +150,7 @@ def _targets(parts: _Sections) -> tuple[F1, bool]:
         raise file.wrong(at, f"{len(values)} targets, Target-count says {count}")
     step = np.diff(values)
     if count < 2 or not ((step > 0.0).all() or (step < 0.0).all()):
-        raise file.wrong(at, "targets have to rise or to fall from each to the next, and to be two or more")
+        raise file.wrong(at, "expected two or more targets, all rising or all falling")
     return np.array(values), both
 
 
@@ -196,7 +196,7 @@ def _rows(parts: _Sections, targets: int, runs: int) -> tuple[list[Row], list[st
         run, target = _whole(file, line, cells[0], "the run"), _whole(file, line, cells[1], "the target")
         wanted, place = divmod(k, targets)
         if wanted >= runs:
-            raise file.wrong(line, f"a row more than {runs} runs of {targets} targets have")
+            raise file.wrong(line, f"more rows than {runs} runs of {targets} targets")
         way = (1 if target == 1 else -1) if place == 0 else out[-1][1]
         if (run, target - 1) != (wanted + 1, place if way > 0 else targets - 1 - place):
             expected = f"run {wanted + 1}, target {(place if way > 0 else targets - 1 - place) + 1}"

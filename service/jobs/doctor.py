@@ -25,7 +25,7 @@ from abbe.service.storage.store import Store
 
 State = Literal["good", "look", "bad"]
 FREE_BYTES, FREE_LOW_BYTES = 5 * 10**9, 10**9
-"""Free space of the database's disk, bytes: less than the first is told, less than the second is bad (a campaign has about 0.1 GB)."""
+"""Free space of the database's disk, bytes: below the first a warning, below the second an error (a campaign has about 0.1 GB)."""
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized"), Path("/run/chrony"), Path("/run/ntpd.pid")
 """A file or folder of a program that sets the clock."""
 SOON = timedelta(days=30)

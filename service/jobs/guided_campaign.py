@@ -120,8 +120,8 @@ async def _check_table_acts(session: Session) -> None:
     base = await read_base(session.controller)
     status = await session.controller.status()
     if base.tables is not None and not status.compensation_on:
-        why = f"table {base.crc:08X} does not act: the compensation is switched off"
-        raise TableMismatch(why, "switch it on at the control and start again; nothing was measured")
+        why = f"table {base.crc:08X} has no effect: the compensation is switched off"
+        raise TableMismatch(why, "switch the compensation on at the control and start again; nothing was measured")
 
 
 class _PromptedPerson:

@@ -230,7 +230,7 @@ class ControllerPort:
             ended.cancel()
 
     async def _look(self) -> Truth:
-        """Read the controller's state. Only here is a restart of the controller no error: its new boot id tells the push machine."""
+        """Read the controller's state. Only this read accepts a restart of the controller: the push machine sees its new boot id."""
         if not self._map:
             self._map = (await self._c.identify()).firmware
         try:

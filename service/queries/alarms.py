@@ -61,7 +61,7 @@ Result = TypeVar("Result", bound=StoredResult)
 Step = Literal["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
 StepState = Literal["done", "now", "waiting", "failed", "skipped"]
 SEARCHED = ("EXPLAINED", "PROPOSED", "FITTED", "UNEXPLAINED")
-"""States of a search that has told a cause, or that there is none that it knows."""
+"""States of a search that has found a cause, or has excluded all causes that it knows."""
 APPROVED = ("approved", "pushed", "kept", "rolled back")
 LATEST = 20
 MOST_PATHS = 5
@@ -79,24 +79,24 @@ class PathStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmPath:
-    """The way of one alarm."""
+    """The steps of one alarm, from its check to the report."""
 
     alarm: int
     steps: Sequence[PathStep]
 
     @property
     def now(self) -> PathStep | None:
-        """The step that is next; None: everything is done, or a step failed."""
+        """The next step; None: everything is done, or a step failed."""
         return next((step for step in self.steps if step.state == "now"), None)
 
 
 def path_of_alarm(reader: Reader, number: int) -> AlarmPath | None:
-    """The way of an alarm of this service's machine; None: there is no such alarm."""
+    """The steps of an alarm of this service's machine; None: there is no such alarm."""
     return next((_AlarmHistory(reader, entries).path(one) for one, entries in _alarms(reader) if one.number == number), None)
 
 
 def path_with(reader: Reader, key: Step, number: int) -> AlarmPath | None:
-    """The way of the newest alarm that has an object in a step, e.g. a proposal; None: no alarm has."""
+    """The steps of the newest alarm whose step ``key`` concerns object ``number``, e.g. proposal 3; None: there is none."""
     for one, entries in _alarms(reader)[:MOST_PATHS]:
         found = _AlarmHistory(reader, entries).path(one)
         if any(step.key == key and step.number == number for step in found.steps):
@@ -111,7 +111,7 @@ def _alarms(reader: Reader) -> list[tuple[Alarm, list[AlarmEntryRecord]]]:
 
 
 class _AlarmHistory:
-    """What the store holds about the way of one alarm. What the service recorded for it counts first, then what came after it."""
+    """Stored records about the steps of one alarm. Records that name the alarm count first, then later records."""
 
     def __init__(self, reader: Reader, entries: Sequence[AlarmEntryRecord]) -> None:
         self._reader, self._entries = reader, entries

@@ -159,7 +159,7 @@ def _run(row: Doc) -> RunSummary:
 
 
 def _reason(state: str, reason: str, end: Doc | None) -> str:
-    """Tell why a run is not complete, or which samples a complete run lacks."""
+    """Return why a run is not complete, or which samples a complete run lacks."""
     if state == INCOMPLETE:
         return "its process ended before the run was closed; the next command that connects to the machine takes over what was saved"
     gaps = (end or {}).get("gaps") or []

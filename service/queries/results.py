@@ -216,7 +216,7 @@ def _check(row: Doc) -> Verification | None:
 
 
 def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limit: int = CHECKS) -> Trends:
-    """Tell whether the figures of a machine's checks drift, since when, and when they reach their limits.
+    """Return the trend of the figures of a machine's checks: drift, its start, and the days until their limits.
 
     Uses at most ``limit`` of the checks later than ``after_utc``; None: since the table came into force.
     """

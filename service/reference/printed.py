@@ -158,7 +158,7 @@ def fit(computed: Computed, number: Expected) -> Fit:
 
 
 def agrees(computed: Computed, number: Expected) -> bool:
-    """Tell whether a computed number equals the printed one or lies within the rounding of its inputs, without padded zeros."""
+    """Return whether a computed number equals the printed one or lies within the rounding of its inputs, without padded zeros."""
     return fit(computed, number) not in ("padding", "no")
 
 

@@ -135,7 +135,7 @@ def doc_digest(value: Any) -> str:
 
 
 def provenance(digest: str, made: Mapping[str, str] | None = None) -> dict[str, str]:
-    """Hash of the data, and versions of this program and of the one that computed the result (``made``), if recorded.
+    """Hash of the data, version of this program, and version of the program that computed the result (``made``), if recorded.
 
     It has no time stamp, so that equal data give equal reports.
     """

@@ -54,7 +54,7 @@ def solution_sections(found: Assessment, solution: SolutionFile) -> list[Section
     return [
         Section("Parameters", _parameters(found)),
         Section("Error motions", _motions(found)),
-        Section("What these runs tell about each error motion", _observability(found, shares)),
+        Section("Information of these runs about each error motion", _observability(found, shares)),
         Section("Uncertainty in the volume", _volume(found)),
         *_tables(solution),
     ]

@@ -40,7 +40,7 @@ def artefact_data(run: Run, setup: ArtefactSetup) -> RunData:
     deviation = np.column_stack([c.further.get(f"deviation_{a}_mm", np.full(len(c), np.nan)) for a in "xyz"]).astype(np.float64)[rows]
     component, at = np.nonzero(np.isfinite(deviation).T)
     if at.size < FEWEST:
-        raise MeasurementFault(f"run {run.run_id}: only {at.size} sensed components", "measure it again")
+        raise MeasurementFault(f"run {run.run_id}: only {at.size} valid deviations", "measure it again")
     names = c.further[FEATURE][rows]
     points = _points(run, setup, setup.features, rows[at], component)
     u = np.asarray(c.further["u_mm"][rows], dtype=np.float64)[at]

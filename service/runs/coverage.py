@@ -130,7 +130,7 @@ def covered_share(run: Run) -> float | None:
 
 
 def not_judged(run: Run) -> str:
-    """Tell why a run gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
+    """Return why a run gives no result, e.g. ``stopped: 4.5 % of the path; not judged``; empty if it is judged."""
     status = COMPLETE if run.state is None else run.state.status
     share = covered_share(run)
     if status == COMPLETE and (share is None or share >= LEAST):

@@ -139,7 +139,7 @@ def _slot(name: str, slot: datetime) -> str:
 
 
 def span(length: timedelta) -> str:
-    """Return a duration as text, coarsely."""
+    """Return a duration as text, in whole seconds, minutes, hours or days."""
     seconds = length.total_seconds()
     if seconds < 120:
         return f"{seconds:.0f} s"

@@ -47,7 +47,7 @@ AfterCheck = Callable[[Doc, int], Awaitable[str]]
 
 
 class OpenSlot(NamedTuple):
-    """A slot left open by a service that is gone. ``ran``: the machine had begun to move for it."""
+    """An unfinished slot of a service that ended. ``ran``: the machine had begun to move for it."""
 
     slot_utc: datetime
     ran: bool

@@ -1,7 +1,7 @@
 """Touches one feature of an artefact: protected way there, approach, touch, retract, repeats, and back above it.
 
 Every way between the artefact's features is a touch command, too, so that an unexpected contact stops the axes. After a missed contact,
-false trips or a stylus that stays deflected, the stylus is taken out first, the way it came.
+false trips or a stylus that stays deflected, the stylus is first withdrawn along its approach.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ async def guarded_move(controller: Motion, target: Point, *, feed_mm_min: float,
     await probe.move(start, feed_mm_min=feed_mm_min, timeout_s=timeout_s)
     x, y, z = latch.position_mm
     raise Obstructed(
-        f"the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way to where the artefact is mounted",
+        f"the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way to the artefact",
         "the axes backed off; jog the stylus clear of everything, then start again",
     )
 
@@ -141,7 +141,7 @@ class FeatureTouch:
             if latch is None:
                 raise MissedContact(
                     f"feature {step.feature}: no contact within {step.search_mm:g} mm of where it was expected",
-                    "is it there, the artefact where stated, the probe's battery good? then resume",
+                    "check the feature, the place of the artefact and the probe's battery, then resume",
                 )
             found.append(latch.position_mm)
             same = [p for p in found if math.dist(p, latch.position_mm) <= AGREE_MM]
@@ -183,11 +183,11 @@ class FeatureTouch:
         x, y, z = latch.position_mm
         raise Obstructed(
             f"feature {self.step.feature}: the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way",
-            "is the artefact as stated (turned by 90 degrees, another, a clamp in the way)? the axes backed off; correct it, then resume",
+            "the axes backed off; check the artefact (turned by 90 degrees? another one? a clamp in the way?), then resume",
         )
 
     async def _free(self) -> None:
-        """Wait until the stylus is at rest. One that stays deflected is taken out by plain moves: no touch command works then."""
+        """Wait until the stylus is at rest. A stylus that stays deflected is withdrawn by plain moves: touch commands do not work then."""
         for _ in range(round(RESEAT_S / POLL_S)):
             if not (await self.probe.probe_state()).deflected:
                 return
@@ -217,7 +217,7 @@ class FeatureTouch:
         if abs(off) > RADIUS_MM:
             raise ProbeUncalibrated(
                 f"feature {self.step.feature}: its radius comes out {abs(off):.3f} mm too {'large' if off > 0.0 else 'small'}",
-                "is this the stated stylus, qualified, and the feature's radius as stated? correct stylus_radius_mm or radius_mm",
+                "qualify the stylus; correct stylus_radius_mm or the radius_mm of the feature",
             )
 
 
@@ -229,6 +229,6 @@ def check_unmoved(record: dict[str, Any], earlier: list[dict[str, Any]]) -> None
     moved = math.dist(found_feature(record).centre_mm, found_feature(before).centre_mm)
     if moved > MOVED_MM:
         raise SetupDisturbed(
-            f"feature {record['feature']} lies {1e3 * moved:.0f} um from where it was after {len(earlier)} features: the artefact moved",
+            f"feature {record['feature']} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: the artefact is loose",
             "its points so far are kept as evidence; it is clamped anew and measured from the beginning",
         )

@@ -365,7 +365,7 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
     segment, off_mm = _nearest(trail, here, resume_trail.to, latest=resume_trail.latest)
     if off_mm > OFF_PATH_MM:
         raise SetupDisturbed(
-            f"the machine stands {off_mm:.3f} mm off the way that the test came",
+            f"the machine stands {off_mm:.3f} mm off the path of the test",
             "it was moved during the break: the set-up is mounted anew",
         )
     if len(trail) == 1:

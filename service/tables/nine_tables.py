@@ -69,7 +69,7 @@ def check_test_step(tables: NineTables, active: NineTables | None, limits: PushL
             if not np.isfinite(values).all():
                 raise TableRefused(f"{name}: holds values that are not numbers", "check the solution; nothing was written")
             if abs(values[0]) > 5e-7:
-                raise TableRefused(f"{name}: not zero at its reference", "shift the table so that it is; nothing was written")
+                raise TableRefused(f"{name}: not zero at its reference", "shift the table to zero there; nothing was written")
             against += [f"{no} ({name})" for no in size_reasons(position.tolist(), values.tolist(), before.tolist(), limits)]
     for i in range(3):
         total_mm = sum(float(np.abs(tables.correction_mm[a][:, i]).max()) for a in range(3))

@@ -49,7 +49,7 @@ class FiredRule:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmHead:
-    """What everybody is told of an alarm.
+    """State of an alarm as all interfaces publish it.
 
     ``signals``: of the last check that raised or held it; ``verification``: number of that check; ``comment``: of the person who
     acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past.
@@ -103,7 +103,7 @@ class Alarm(AlarmHead):
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """Return the effect of a check on ``now``, the alarm of its recipe (None: there is none); None: no effect."""
+    """Return the effect of a check on ``now``, the alarm of its recipe or None; None if the check has no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:

@@ -121,7 +121,7 @@ def _feed(mm_min: float) -> str:
 
 
 def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -> list[str]:
-    """Tell how places, tables in force, directions and feeds differ from those of the first run. ``feed`` formats mm/min with its unit."""
+    """How places, tables in force, directions and feeds differ from those of the first run. ``feed`` formats mm/min with its unit."""
     out = []
     first = loaded[0]
     for other in loaded[1:]:

@@ -152,7 +152,7 @@ def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
     else:
         along, turned = (axes - start) @ (way / np.linalg.norm(way)), 1.0
     if turned == 0.0 or not np.isfinite(deviation[keep]).all():
-        raise MeasurementFault(f"run {run.run_id}: it is not a test along {name}, or a deviation is not a number", "leave it out")
+        raise MeasurementFault(f"run {run.run_id} is not a test along {name}, or has a deviation that is not a number", "leave the run out")
     sign = run.columns.direction * turned
     return _place(along)[keep], sign[keep], (deviation * turned)[keep]
 

@@ -52,7 +52,7 @@ BAR_STATEMENT = (
 class Evaluated:
     """Results of evaluated runs for a report.
 
-    ``statements`` are part of the uncertainty statement; ``conditions`` tell of each test how it was reduced to 20 °C.
+    ``statements`` are part of the uncertainty statement; ``conditions`` state for each test how it was reduced to 20 °C.
     """
 
     figures: list[ReportFigure] = field(default_factory=list)
@@ -106,7 +106,7 @@ def evaluate(
 
 
 def laser_inputs(instruments: dict[str, Any]) -> StatedInputs:
-    """Stated inputs of a laser: the defaults, or what the campaign file widens because it is unknown."""
+    """Stated inputs of a laser: the defaults, or larger uncertainties that the campaign file states."""
     laser, usual = instruments.get("laser") or {}, StatedInputs()
     wave, kelvin = laser.get("u_wavelength", usual.u_wavelength), laser.get("u_scale_temperature_k", usual.u_scale_temperature_k)
     return replace(usual, u_wavelength=float(wave), u_scale_temperature_k=float(kelvin))

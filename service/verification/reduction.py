@@ -21,7 +21,7 @@ PER_UM = 1e6
 AIR_APART_K = 2.0
 """By how much air and scale may differ before the report says so."""
 AT_20, DIAGONAL_AT_20 = "ISO 230-2 at 20 °C", "ISO 230-6 at 20 °C"
-"""Begin the name of the condition that tells how a test was reduced."""
+"""Prefix of the condition that states how a test was reduced."""
 REDUCTION_STATEMENT = (
     "Reduction to 20 °C (ISO 230-2 and 230-6, nominal differential expansion): deviation as measured - (scale - laser) (t - 20 °C) travel, "
     "where the laser's coefficient is that of its own compensation of material, 0 if it is off; on a diagonal each axis counts with the "

@@ -87,19 +87,19 @@ def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
     Raises
     ------
     MeasurementFault
-        A run is not one of an artefact of this solution, lies as one that it used, or is not judged.
+        A run is not of an artefact of this solution, repeats one of its poses, or is not judged.
     """
     poses = {}
     for run in runs:
         check_judged(run)
         if not isinstance(run.setup, ArtefactSetup) or f"form_{run.setup.artefact}_" not in " ".join(known.estimate.names):
             raise MeasurementFault(
-                f"run {run.run_id} is not of an artefact whose form is known", "measure the same artefact in another pose"
+                f"the solution does not contain the artefact of run {run.run_id}", "measure the same artefact in another pose"
             )
         data = run_data(run)
         if any(same_pose(data, used) for used in known.data):
             raise MeasurementFault(
-                f"run {run.run_id} is in a pose that the solution has used: there it says of the form whatever suits the machine",
+                f"run {run.run_id} repeats a pose of the solution, where the fitted form of the artefact hides errors of the machine",
                 "turn the artefact, or shift it by more than a few mm",
             )
         poses[run.run_id] = pose_figure(data, known)
@@ -119,10 +119,10 @@ def check_before(before: VerificationFigures) -> None:
     TableRefused
         A figure is not a number, or no air temperature is recorded.
     """
-    what = "" if before.finite else "a figure of it is not a number"
+    what = "" if before.finite else "a figure is not a number"
     what = what or ("" if before.air_c is not None else "no air temperature was recorded")
     if what:
-        raise TableRefused(f"nothing can be compared with the verification before: {what}", "measure it again; nothing was written")
+        raise TableRefused(f"the first verification is no basis for a comparison: {what}", "measure it again; nothing was written")
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,7 +46,7 @@ def for_people(request: Request) -> bool:
 
 
 class ErrorPages:
-    """Shows a problem document to people as a screen: whatever refuses a request, a browser's address bar gets no JSON.
+    """Shows a problem document to people as a screen: a browser's address bar never shows JSON, whichever layer refuses the request.
 
     Pure ASGI, outside of everything that refuses. ``status``: source of the status bar.
     """

@@ -90,7 +90,7 @@ def _add_stopping(app: FastAPI, core: CoreLine) -> None:
     @app.post("/api/v1/stop", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
     @needs(Permission.STOP)
     async def stop(request: Request) -> Response:
-        """Stop whatever runs, as ``/api/v1/jobs/{job}/stop`` does. A session that has run out is enough; 409: nothing runs."""
+        """Stop the running job, as ``/api/v1/jobs/{job}/stop`` does. A session that has run out is enough; 409: nothing runs."""
         visit: Visit = request.state.visit
         running = next((job for job in core.jobs() if job.ended_utc is None), None)
         if running is None:

@@ -2,7 +2,7 @@
 addresses stay in SI, so a link means the same to every reader.
 
 `shown` formats a number or an already rounded text, `rounded` a number with its uncertainty; `drawn_in` is the unit of a picture. Scripts
-get sign and size of the unit with their page. Not converted: pictures of reports (run, discovery, proposal), whose axes are in µm and mm,
+read symbol and size of the unit from their page. Not converted: pictures of reports (run, discovery, proposal), with axes in µm and mm,
 and stored sentences (verdicts, advice, refusals, messages of a running job), which name their unit. Ratios such as µm/m have the same value
 in µin/in and stay as they are; so do angles.
 """

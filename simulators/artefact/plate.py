@@ -1,6 +1,6 @@
 """A plate of holes or balls: its true form, how it grows and bends, and where it lies on the table.
 
-Nobody calibrated the plate beyond one length: form and bends are unknown to whoever measures it. The plate fills the half space below its
+Only one length of the plate is calibrated: its form and bends are unknown to the product. The plate fills the half space below its
 top, z = 0 of its own axes; holes go through it, balls stand on it.
 """
 

@@ -1,6 +1,6 @@
 """One sealed case: effects sized by their visibility, runs with readings, and the truth by which an answer is judged.
 
-Rivals of a hidden effect are those that are indistinguishable from it: first-order textbook traces of every named effect tell them.
+Rivals of a hidden effect are those that are indistinguishable from it: they are found by first-order textbook traces of every named effect.
 """
 
 from collections.abc import Callable, Iterator
@@ -388,7 +388,7 @@ def _fact(
 
 
 def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: list[str]) -> dict[str, list[str]]:
-    """Return which further measurements would tell each alias from the effect: those of plan full if they suffice, else `BEYOND`."""
+    """Return the further measurements that would separate each alias from the effect: those of plan full if they suffice, else `BEYOND`."""
     if not aliases:
         return {}
     still: list[str] = aliases

@@ -109,7 +109,7 @@ class Play:
         self.position_mm: F = start_mm - 0.5 * backlash_mm
 
     def run(self, drive_mm: F) -> F:
-        """Follow the drives through n successive positions: (n, 3) gives the axis positions (n, 3)."""
+        """Return the axis positions (n, 3), mm, that follow n successive drive positions (n, 3), mm."""
         out = np.empty_like(drive_mm)
         for axis in range(3):
             out[:, axis] = self._run_axis(drive_mm[:, axis], self._half[axis], float(self.position_mm[axis]))
@@ -117,7 +117,7 @@ class Play:
         return out
 
     def ahead(self, drive_mm: F) -> F:
-        """Return what `run` would return, and remember nothing."""
+        """Return the result of `run` without changing the state."""
         kept = self.position_mm
         out = self.run(drive_mm)
         self.position_mm = kept

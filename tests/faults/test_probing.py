@@ -137,7 +137,7 @@ async def test_a_plate_that_slips_is_named_and_clamped_and_measured_anew(place):
     made = plan()
     await run(place, made, at(made, 2, lambda: b.sim.world.table.move(np.array([0.05, 0.0, 0.0]))))
     first, second = store.runs.all()
-    assert first.reason.startswith("SEQ-008: feature A1 lies 50 um from where it was after 3 features: the artefact moved")
+    assert first.reason.startswith("SEQ-008: feature A1 moved by 50 um while 3 features were touched: the artefact is loose")
     assert (first.status, second.status) == ("failed", "complete")
     assert second.start_doc["setup"]["setup_id"] == "S-2"
     assert found(store) == ALL
@@ -267,7 +267,7 @@ async def test_begun_anew_with_the_stylus_in_a_hole_it_stops_at_the_wall(place):
     b, store = place
     await aborted_in_the_second_hole(place, plan())
     begin = b.sim.world.controller.position_mm.copy()
-    with pytest.raises(Obstructed, match="on its way to where the artefact is mounted"):
+    with pytest.raises(Obstructed, match="on its way to the artefact"):
         await measure(b.session, store, b.site, CampaignPlan("another", plan().tests), options=MeasureOptions(None))
     assert np.abs(b.sim.world.controller.position_mm - begin).max() < 0.01, "it backed off"
 

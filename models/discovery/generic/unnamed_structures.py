@@ -112,7 +112,7 @@ def bump(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def place_at(paths: tuple[Path, ...], at_s: float) -> F1:
-    """Commanded position (3,), mm, at a time of the campaign, interpolated between readings; between runs, that of the nearest run."""
+    """Commanded position (3,), mm, at a time of the campaign: interpolated in the run that covers or is nearest to this time."""
 
     def apart(p: Path) -> float:
         return max(float(p.at.t_s[0]) - at_s, at_s - float(p.at.t_s[-1]), 0.0)

@@ -74,7 +74,7 @@ EFFECT = Effect(
         Form("turning", of_machine(_turning)),
         Form("run-in", of_machine(_run_in)),
     ),
-    needs="runs in both directions; a laser alone hardly tells X, Y and Z apart",
+    needs="runs in both directions; a laser alone hardly separates X, Y and Z",
     signature="circle and helix: a step outward at both ends of the axis, equal at all feeds; laser: forth and back stay apart",
     remedy="control parameter",
     remedy_text="enter the width as backlash compensation of the axis; if it grows or exceeds 30 um: screw nut, coupling, thrust bearing",

@@ -31,7 +31,7 @@ RANK_TOLERANCE = 1e-3
 """Singular values below this share of the largest do not count: the coefficient would be a thousand times less certain than a reading."""
 FLATNESS = 5e-3
 """Default tolerance of a plane, as a share of the second largest half width of X, Y, Z: 5 um for a square of +-1 mm. A stage with errors of
-1 um leaves its plane, but so little height tells nothing: an error of 10 um per mm of height changes by 0.05 um over it."""
+1 um leaves its plane, but so little height gives no information: an error of 10 um per mm of height changes by 0.05 um over it."""
 
 
 def term_name(term: Exponents) -> str:

@@ -74,7 +74,7 @@ class Anova:
         return critical_f(self.df_reg, self.df_res, alpha)
 
     def significant(self, alpha: float = 0.01) -> bool:
-        """Tell whether the regression explains more than chance at the level alpha; False if F is `undefined`."""
+        """Return whether the regression explains more than chance at the level alpha; False if F is `undefined`."""
         return bool(self.p < alpha)
 
 

@@ -1,4 +1,4 @@
-"""Experiments on Yang's machine as least-squares problems: what each could tell about the 21 error functions.
+"""Experiments on Yang's machine as least-squares problems: how well each could determine the 21 error functions.
 
 The experiments are ball-bar helices about one or several cups, step diagonals with a flat mirror, plain diagonals, and whole vector maps,
 with or without unknowns of the set-up. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. The number and

@@ -1,4 +1,4 @@
-"""What the poses of a probed artefact can tell of a plane, what they hide, and which further pose would tell it.
+"""Errors of a plane that the poses of a probed artefact show, errors that they hide, and the further pose that would show those.
 
 The form of the artefact is free, so only what moves against it shows. The analysis takes fields of the machine in the plane up to degree 4
 (27 beside rigid motions), the points of every pose, a free pose each and a free form, all of first order; without a calibrated length the
@@ -20,7 +20,7 @@ from abbe.models.solvers.observations import RunData
 DEGREE = 4
 HIDDEN, TOLERANCE = 0.02, 1e-3
 """A field is hidden if less than the first share of it is left without form and poses; singular values that count, to the largest: poses
-that differ by a millimetre only on paper tell nothing of micrometres."""
+that differ by a millimetre only on paper give no information about micrometres."""
 FLAT = 1e-3
 SHIFT = 0.37
 """Proposed shift as a share of a pitch: no simple fraction, so that it also shifts against the lead of a screw."""
@@ -29,7 +29,7 @@ SHIFT = 0.37
 @dataclass(frozen=True)
 class PoseRank:
     """``rank`` of the ``of`` fields beside rigid motions; ``hidden``: named fields that leave no trace; ``cures``: further poses with the
-    rank that they would give and what they would tell."""
+    rank that they would give and errors that they would show."""
 
     plane: str
     rank: int
@@ -45,7 +45,7 @@ class PoseRank:
             return out + "."
         out += f"; they hide: {', '.join(self.hidden)}."
         said = [f"{pose} ({rank} fields{': ' + ', '.join(told) if told else ''})" for pose, rank, told in self.cures[:2]]
-        return out + (f" A further pose would tell more: {'; or '.join(said)}." if said else " A calibrated length would tell the scale.")
+        return out + (f" A further pose would show more: {'; or '.join(said)}." if said else " A calibrated length would give the scale.")
 
 
 def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:

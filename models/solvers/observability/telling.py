@@ -1,4 +1,4 @@
-"""Which runs tell an error motion: how strongly the readings of each run change with it."""
+"""Runs that show an error motion: how strongly the readings of each run change with it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ ROUNDING = 1e-9
 def run_sensitivity(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...]) -> tuple[tuple[str, ...], F2]:
     """Rms change of the readings of each run per unit rms of each motion over its stroke, mean over the motion's shapes.
 
-    What the unknowns of the run's own set-up (cup, bar, mirror, drift) can take up is removed; that other motions may look alike is not.
+    The part that unknowns of the set-up (cup, bar, mirror, drift) absorb is removed, the part that other motions could explain is not.
 
     Returns
     -------

@@ -78,16 +78,16 @@ def init(  # noqa: PLR0913 - one option for each question
 
 
 def _asked(given: str | None, question: str, usual: str, parse: Callable[[str], Any], option: str) -> Any:
-    """Return an answer: of the option, else of the person; without a terminal, an address or a date is left out.
+    """Return the answer given by the option, else at the terminal; without a terminal, leave out an address or a date.
 
     Raises
     ------
     ConfigError
-        The answer cannot be understood, or there is none and nobody to ask.
+        The answer cannot be parsed, or it is missing and there is no terminal.
     """
     if given is None and not sys.stdin.isatty():
         if usual != "-" and parse is not _url:
-            raise ConfigError(f"{option} is missing, and nobody is at the terminal to ask", f"add {option}, e.g. {option} {usual}")
+            raise ConfigError(f"{option} is missing, and standard input is not a terminal", f"add {option}, e.g. {option} {usual}")
         given = "-"
     while True:
         text = (given if given is not None else str(typer.prompt(question, default=usual, err=True))).strip()

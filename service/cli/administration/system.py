@@ -80,7 +80,7 @@ def sim(
 
 
 def _write_machine_file(line: bytes, file: Path, *, as_json: bool) -> None:
-    """Write the machine file of simulators that have told their addresses; nothing if they have ended."""
+    """Write the machine file of simulators that have reported their addresses; nothing if they have ended."""
     from dataclasses import replace
     from datetime import timedelta
 

@@ -225,7 +225,7 @@ def _answer(name: str, question: Question) -> Any:
 def _choice(text: str, choices: Sequence[str], usual: str | None = None) -> str:
     """Ask until one of the choices is given."""
     while (found := str(typer.prompt(f"{text} ({', '.join(choices)})", default=usual))) not in choices:
-        typer.echo(f"{found!r} is none of them")
+        typer.echo(f"{found!r} is not one of the choices")
     return found
 
 

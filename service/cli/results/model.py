@@ -82,7 +82,7 @@ def show_model(
     rows = [(e.full_title, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
     print_table(("effect", "size, U (k = 2)", "remedy", "from campaign"), rows)
     if found.book.gone:
-        typer.echo("no longer there: " + ", ".join(found.book.gone))
+        typer.echo("removed: " + ", ".join(found.book.gone))
     source = found.book.provenance
     if source is not None:
         typer.echo(f"{len(source.runs)} runs of campaign {source.campaign}, Abbe {source.versions.get('abbe', '?')}")

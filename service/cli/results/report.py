@@ -112,7 +112,7 @@ def _day(text: str | None) -> date | None:
     try:
         return None if text is None else date.fromisoformat(text)
     except ValueError:
-        raise ConfigError(f"--measured-on is {text!r}, no day", "give it as 2026-11-26") from None
+        raise ConfigError(f"--measured-on is {text!r}, expected a day", "give it as 2026-11-26") from None
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:

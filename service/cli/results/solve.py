@@ -85,7 +85,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
     without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
     without_scale: Annotated[
-        bool, typer.Option("--without-scale", help="Leave scales that the runs hardly tell out of --grid, --tables and --at.")
+        bool, typer.Option("--without-scale", help="Leave scales that the runs determine poorly out of --grid, --tables and --at.")
     ] = False,
     details: Annotated[bool, typer.Option("--details", help="Also print all parameters, comparisons, noise, and what is missing.")] = False,
 ) -> None:

@@ -119,7 +119,7 @@ def _parameters(summary: Assessment) -> None:
     for axis, (v, u) in summary.joint.backlash_mm().items():
         rows.append([f"backlash {axis}", _figure(v * 1e3), f"{2 * u * 1e3:.2f}", "µm", "lost motion"])
     print_table(["parameter", "value", "U (k = 2)", "unit", "what"], rows)
-    typer.echo(f"scales (EXX, EYY, EZZ) hold {SCALE_NOTE}")
+    typer.echo(f"scales (EXX, EYY, EZZ) are valid {SCALE_NOTE}")
     by_status = {s: ", ".join(n for n, v in status.items() if v == s) or "none" for s in ("observed", "weak", "not observable")}
     typer.echo("error motions, each by itself: " + "; ".join(f"{s}: {names}" for s, names in by_status.items()))
 

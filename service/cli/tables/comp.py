@@ -79,7 +79,7 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     without_table: Annotated[
         bool, typer.Option("--without-table", help="I know that no correction was in force while this was measured.")
     ] = False,
-    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out the scales that the runs hardly tell.")] = False,
+    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out scales that the runs determine poorly.")] = False,
     sign: Annotated[
         Path | None,
         typer.Option("--sign", metavar="KEY", help="Private key that signs for this machine; writes FILE.sig.", show_default=False),
@@ -159,7 +159,7 @@ def write_step(
         print_json({"files": written, "place": step.place, "expected": step.expected})
         return
     typer.echo(f"wrote {', '.join(written)}\nload it instead of every other table; {step.place}: {step.expected}")
-    typer.echo("by the other way, and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table")
+    typer.echo("moved the other way, and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table")
     conclude(f"abbe comp export SOLUTION --format {form} --step-moved -10 --out tables", machine=machine)
 
 

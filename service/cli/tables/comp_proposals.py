@@ -35,7 +35,7 @@ ProposalArgument = Annotated[int, typer.Argument(metavar="PROPOSAL", help="Numbe
 
 def propose(
     campaign: Annotated[str, typer.Argument(metavar="CAMPAIGN", help="Identification campaign in the store.")],
-    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out the scales that the runs hardly tell.")] = False,
+    without_scale: Annotated[bool, typer.Option("--without-scale", help="Leave out scales that the runs determine poorly.")] = False,
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -64,7 +64,7 @@ def propose(
         made = run_job(work(store))
         _print_made(store, made, as_json=as_json)
     if made.proposed.reasons and not without_scale and not as_json and assess(made.solved).scale_free is not None:
-        typer.echo(f"the runs hardly tell the scales; tables of all the rest: abbe comp propose {quote(campaign)} --without-scale")
+        typer.echo(f"the runs determine the scales poorly; tables without the scales: abbe comp propose {quote(campaign)} --without-scale")
     conclude(f"abbe comp {'show' if made.proposed.reasons else 'diff'} {made.number}", machine=machine, as_json=as_json)
     raise typer.Exit(1 if made.proposed.reasons else 0)
 

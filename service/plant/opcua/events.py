@@ -1,4 +1,4 @@
-"""Events of the OPC UA server: a check has ended, an alarm is new. Those of before the start are in the variables only."""
+"""Events of the OPC UA server: a check has ended, an alarm is new. Earlier events are in the variables only."""
 
 from __future__ import annotations
 

@@ -261,7 +261,7 @@ def _variance() -> list[Comparison]:
 
 
 def _over_61(c: str) -> bool:
-    """Tell whether the residual mean square of a component results from a division by 61 and not by the printed 60."""
+    """Return whether the residual mean square of a component results from a division by 61 and not by the printed 60."""
     residual, printed = paper.TABLE2_SUMS[c][1], paper.TABLE2_MEAN_SQUARES[c][1]
     n = int(paper.DOF_RESIDUAL.value)
     by_60, by_61 = computed_from(lambda s: s / n, residual), computed_from(lambda s: s / (n + 1), residual)

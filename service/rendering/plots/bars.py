@@ -122,7 +122,9 @@ def _stated(side: tuple[float, float] | None, unit: Unit) -> str:
     return "–" if side is None else "{} ± {} {}".format(*with_uncertainty(*side), unit.sign)
 
 
-def share_plot(rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "What the readings tell about each error motion") -> str:
+def share_plot(
+    rows: Sequence[MotionShare], *, key: str = "shares", heading: str = "Information of the readings about each error motion"
+) -> str:
     """Share of information from readings per error motion, with its status, in the given order; the bar is empty if not observable."""
     width, row_height, top, labels, texts = 500.0, 20.0, 54.0, 64.0, 118.0
     kept = [r.name for r in rows if r.status == "observed"]

@@ -69,7 +69,7 @@ from abbe.service.sequences.steps import (
 )
 
 MIN_TURNS = 3.0
-"""With fewer turns cup offset, scale and squareness are hardly told apart (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
+"""With fewer turns cup offset, scale and squareness are hardly separated (condition number 28 at 3 turns, 58 at 2, 1900 at 1)."""
 PARTIAL_DEG, PARTIAL_LEAD_DEG = 220.0, 2.0
 """Span of the partial arc of ISO 230-4, degrees, and of each of its feed-in and feed-out."""
 Turns = Annotated[float, Limits(ge=3.0, le=50.0)]
@@ -290,7 +290,7 @@ def _bar_plan(recipe: BarRecipe, test: str, machine: Machine, path: Doc, again: 
 def _check_turns(label: str, turns: float) -> None:
     if not MIN_TURNS <= turns < np.inf:
         raise ConfigError(
-            f"test {label}: cup offset and squareness cannot be told apart with {turns:g} turns: a helix needs {MIN_TURNS:g} or more",
+            f"test {label}: cup offset and squareness cannot be separated with {turns:g} turns: a helix needs {MIN_TURNS:g} or more",
             f"set turns to {MIN_TURNS:g} or more; 5 are usual",
         )
 
@@ -339,7 +339,7 @@ class Diagonal(BeamTest):
             A step diagonal with an overrun: its turning points have no approach direction.
         """
         if self.order and self.overrun_mm:
-            raise ConfigError(f"test {self.label}: a step diagonal has no overrun", "leave overrun_mm out, or the order")
+            raise ConfigError(f"test {self.label}: a step diagonal has no overrun", "remove overrun_mm or order")
         box = machine.stroke_mm + np.array([CLEARANCE_MM, -CLEARANCE_MM])
         start, end = diagonal_ends(box, self.diagonal)
         if self.order:

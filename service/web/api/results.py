@@ -33,7 +33,7 @@ Motions = Annotated[list[Motion], Query(max_length=21, description="The map show
 
 
 def _no_number(value: object) -> object:
-    """Refuse a time given as a number of seconds, which nobody can check by eye."""
+    """Refuse a time given as a number of seconds: a person cannot check it by eye."""
     try:
         float(str(value))
     except ValueError:

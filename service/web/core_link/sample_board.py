@@ -55,7 +55,7 @@ class SampleBoard:
         except ValueError:
             raise ChannelBroken("samples on the channel of the service are not base64") from None
         if len(values) % FLOAT_B:
-            raise ChannelBroken(f"samples on the channel of the service are {len(values)} bytes long: no float32")
+            raise ChannelBroken(f"samples on the channel of the service are {len(values)} bytes long, not a multiple of 4")
         frame = HEAD.pack(VERSION, samples.path, samples.first % 2**32, len(values) // FLOAT_B, samples.arrived_ms) + values
         self._frames.append(frame)
         self._publish(frame)

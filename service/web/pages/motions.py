@@ -1,4 +1,4 @@
-"""The 21 error motions with U; of a chosen one, which runs tell it and what a table of its own would leave."""
+"""The 21 error motions with U; of a chosen one, the runs that show it and the error after a table for it."""
 
 from __future__ import annotations
 
@@ -46,7 +46,7 @@ class MotionLine:
 
 @dataclass(frozen=True, slots=True)
 class RunLine:
-    """How one run tells the motion: change of its readings for 10 µm or 10 µrad, their noise, and its share of the information."""
+    """How one run shows the motion: change of its readings for 10 µm or 10 µrad, their noise, and its share of the information."""
 
     label: str
     number: int

@@ -122,7 +122,7 @@ async def test_a_streaming_sensor_on_a_serial_line_passes(value: Path, tmp_path:
         report = await device_test(f"{url}?device={tmp_path / 'sensor.toml'}&baud=9600", options(ask), UTC)
     assert report.failed == ()
     assert report.abilities == (Ability.WATCH, Ability.DWELL)
-    assert verdict(report, "identity") == ("not proved", "streaming sensor: nothing in the device file tells it from another device")
+    assert verdict(report, "identity") == ("not proved", "streaming sensor: nothing in the device file identifies it")
     assert verdict(report, "connection cut")[0] == "not proved"
 
 

@@ -102,7 +102,7 @@ async def solved(url: str, world: World | LineWorld, tmp_path: Path) -> dict[str
 
     with Store.open(f"sqlite:///{tmp_path / 'abbe.sqlite3'}") as store:
         async with recovered_session(store, here, ask=mounts, listening=True) as session:
-            with pytest.raises(ConfigError, match="can only be listened to"):
+            with pytest.raises(ConfigError, match="Abbe can only read this control"):
                 await measure(session, store, here, plan)
             with pytest.raises(NotProved, match="no table is written into it"):
                 await session.controller.write_bank(0, b"")

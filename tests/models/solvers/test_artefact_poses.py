@@ -56,7 +56,7 @@ def test_the_pose_that_would_tell_most_is_named() -> None:
     name, rank, told = found.cures[0]
     assert (name, rank) == ("turned by 90 degrees", 22) or rank >= 22
     assert "squareness" in told
-    assert "A further pose would tell more" in found.text
+    assert "A further pose would show more" in found.text
 
 
 def made(field: np.ndarray) -> RunData:

@@ -268,7 +268,7 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     found = CliRunner().invoke(app, [*words, "--goal-um", "1"])
     assert found.exit_code == 0, found.output
     assert "goal 1 µm is not reached" in found.output
-    assert "this campaign cannot tell" in found.output
+    assert "this campaign cannot determine" in found.output
     assert {r.radius_mm for r in read_recipe(out)[1]} <= {100.0, 150.0}
     html = page.read_text()
     assert "<polyline" in html

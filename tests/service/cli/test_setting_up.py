@@ -67,7 +67,7 @@ def test_a_wrong_answer_leaves_no_file(folder: Path, capsys, changed: tuple[str,
 
 def test_without_a_terminal_nothing_is_guessed(folder: Path, capsys) -> None:
     assert run(["init", *ANSWERS[:4]]) == 2
-    assert "--strokes is missing, and nobody is at the terminal to ask - add --strokes" in capsys.readouterr().err
+    assert "--strokes is missing, and standard input is not a terminal - add --strokes" in capsys.readouterr().err
 
 
 def test_a_person_is_asked_eight_questions(folder: Path) -> None:

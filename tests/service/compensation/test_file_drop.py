@@ -61,7 +61,7 @@ def test_the_controls_own_files_confirm_it(share: Path, capsys: pytest.CaptureFi
     for file in Path("out").iterdir():
         (back / file.name).write_text(file.read_text().replace("\n", "\r\n"))
     assert _drop("--back", "share") == 2
-    assert "these are the files that were dropped" in capsys.readouterr().err
+    assert "these are the dropped files" in capsys.readouterr().err
     assert _drop("--back", "back") == 0
     assert file_drop.receipt(Path("out")).state == "confirmed"
 
@@ -124,7 +124,7 @@ def test_one_thing_at_a_time(share: Path, capsys: pytest.CaptureFixture[str]) ->
     assert _drop("--seen", "--take-back") == 2
     assert _drop("--to", "share") == 2
     assert _drop("--to", "nowhere", "--format", "mach4") == 2
-    assert "nowhere: is no folder" in capsys.readouterr().err
+    assert "nowhere: is not a folder" in capsys.readouterr().err
 
 
 async def test_the_files_of_an_opc_ua_server_are_such_a_place(plant: Plant, tmp_path: Path) -> None:

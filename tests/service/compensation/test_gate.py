@@ -91,12 +91,12 @@ async def test_a_control_that_was_never_proved_stops_the_measurement_for_it(monk
 @pytest.mark.parametrize(
     ("before_um", "after_um", "u_um", "why"),
     [
-        (9.9, 4.0, 10.3, "know the errors too poorly: measure more"),
-        (10.0, 2.0, 4.5, "know the errors too poorly: measure more"),
-        (10.0, 6.0, 2.5, "know the errors too poorly: measure more"),
-        (4.7, 4.2, 0.9, "know the errors too poorly: measure more"),
-        (4.7, 4.4, 0.9, "tables of this kind take out no more"),
-        (10.0, 9.9, 0.01, "tables of this kind take out no more"),
+        (9.9, 4.0, 10.3, "determine the errors too poorly: measure more"),
+        (10.0, 2.0, 4.5, "determine the errors too poorly: measure more"),
+        (10.0, 6.0, 2.5, "determine the errors too poorly: measure more"),
+        (4.7, 4.2, 0.9, "determine the errors too poorly: measure more"),
+        (4.7, 4.4, 0.9, "tables of this kind remove no more"),
+        (10.0, 9.9, 0.01, "tables of this kind remove no more"),
     ],
 )
 def test_tables_that_promise_too_little_are_refused_with_the_true_reason(before_um: float, after_um: float, u_um: float, why: str) -> None:

@@ -150,7 +150,7 @@ def test_the_book_is_used_compared_and_taken_back(abbe: Call, finds: Callable[[S
     finds(Search(width_um=-9.95))  # somebody mended it
     assert "model version 3" in abbe("discover", write_case(tmp_path / "august", campaign="august", width_mm=5e-5), "--db", DB)[1]
     out = abbe("model", "show", "--of", "VMC-1", "--db", DB)[1]
-    assert "no longer there: backlash:X" in out
+    assert "removed: backlash:X" in out
     assert abbe("model", "revert", "--of", "VMC-1", 1, "--db", DB)[1] == "machine VMC-1: version 4 is current; it equals version 1"
     listed = json.loads(abbe("model", "list", "--of", "VMC-1", "--db", DB, "--json")[1])
     assert [(m["version"], [e["label"] for e in m["effects"]]) for m in listed] == [

@@ -294,7 +294,7 @@ def test_an_instrument_that_no_fitted_run_has_is_judged_by_the_noise_of_the_othe
     ("roles", "ahead", "why"),
     [
         (("identify", "identify", "sealed"), 4.2, "it is not proved: no holdout run of this campaign can judge"),
-        (("identify", "identify", "holdout"), 2.9, "these runs hardly tell backlash:X from lateral_play:EYX"),
+        (("identify", "identify", "holdout"), 2.9, "these runs hardly separate backlash:X from lateral_play:EYX"),
         (("identify", "identify", "holdout"), 3.1, None),
     ],
     ids=["nobody judges", "a rival is nearly as likely", "proved and alone"],
@@ -445,7 +445,7 @@ def test_a_finding_comes_back_from_json_as_it_was(folder: Path, search: Search) 
 
 
 def test_points_of_artefacts_are_not_searched(tmp_path: Path) -> None:
-    with pytest.raises(NotObservable, match=r"only points of artefacts.*`abbe discover plate` names what moves with the part"):
+    with pytest.raises(NotObservable, match=r"only points of artefacts.*`abbe discover plate` separates errors of the part"):
         job_of(artefact_campaign(tmp_path))
 
 

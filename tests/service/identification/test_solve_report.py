@@ -83,12 +83,14 @@ def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
     assert free.left_out == stated.without_scale.scales == "common"
     assert stated.without_scale.rms_um < 0.71 * stated.rms_um
     largest = stated.without_scale.expanded_vector_um
-    assert f"without the common scale, which these runs hardly tell, 9 µm rms known to ± {largest:.2g} µm" in solution_verdict(found).text
+    assert (
+        f"without the common scale, poorly determined by these runs, 9 µm rms known to ± {largest:.2g} µm" in solution_verdict(found).text
+    )
     assert free.observability.number.value > found.observability.number.value
     assert "without" not in solution_verdict(free).text
 
     (change, promised, left_out), (_, whole, nothing) = (change_of(found.solved, without_scale=k) for k in (True, False))
-    assert left_out == ("the common scale, which the runs hardly tell: left out",)
+    assert left_out == ("the common scale, poorly determined by the runs: left out",)
     assert nothing == ()
     assert promised.u_model_mm < 0.71 * whole.u_model_mm
     assert promised.after_mm < promised.before_mm
@@ -106,5 +108,5 @@ def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
 def test_bar_and_laser_together_know_the_scale_and_nothing_is_left_out():
     found = assessed("joint")
     assert solution_of(found).uncertainty.without_scale is None
-    with pytest.raises(TableRefused, match="know the scales no worse than the rest"):
+    with pytest.raises(TableRefused, match="determine the scales as well as the rest"):
         scale_free(found)

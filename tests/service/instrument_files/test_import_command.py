@@ -126,7 +126,7 @@ def test_an_import_that_cannot_be_is_one_line(abbe: Abbe) -> None:
     Path("fine.rtl").write_text(renishaw(targets=(0, 0.02, 0.04)))
     Path("x.doc").write_text("x")
     assert "the files name different machines: 'VMC-1' (x.rtl), 'VMC-2' (other.rtl)" in abbe.fails("import", "x.rtl", "other.rtl", "--yes")
-    assert "copy.rtl: its bytes are those of x.rtl" in abbe.fails("import", "x.rtl", "copy.rtl", "--yes")
+    assert "copy.rtl: it is a copy of x.rtl" in abbe.fails("import", "x.rtl", "copy.rtl", "--yes")
     assert "the file does not say which axis was measured - give --axis VALUE (X, Y, Z)" in abbe.fails("import", "u.rtl", "--yes")
     assert "--axis is 'Q' - give one of X, Y, Z" in abbe.fails("import", "u.rtl", "--yes", "--axis", "Q")
     assert "--axis is Y, the file says X" in abbe.fails("import", "x.rtl", "--yes", "--axis", "Y")
@@ -174,7 +174,7 @@ def test_a_trace_asks_for_its_unit_and_place(abbe: Abbe) -> None:
     assert "the file does not say the unit of the readings - give --unit VALUE" in abbe.fails("import", "d.rtx", "--yes", "--axis", "X")
     assert abbe("import", "d.rtx", "--yes", "--axis", "X", "--unit", "um", "--at", "100").code == 0
     assert abbe("report", "d", "--out", "d.json").code == 0
-    assert "the axis stood still: readings over time tell no geometry" in abbe("discover", "d").err
+    assert "the axis stood still: readings over time show no geometry" in abbe("discover", "d").err
 
 
 def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:

@@ -70,7 +70,7 @@ def test_what_is_wrong_in_a_pos(folder: Folder) -> None:
     assert folder.refused("y.pos", POS.replace("200.0000\t-0.0080", "50\t-0.008")).startswith("y.pos:16: position 50 after 100")
     assert folder.refused("y.pos", "hello\n").startswith("y.pos:1: no table")
     other = POS.replace("Reverse Directional Avg Error", "Forward Sigma")
-    assert folder.refused("y.pos", other).startswith("y.pos:13: 'Position   \\tForward Sigma' is no table that is known")
+    assert folder.refused("y.pos", other).startswith("y.pos:13: 'Position   \\tForward Sigma' is not a known table")
 
 
 def test_a_compensation_report_says_its_unit_or_is_asked(folder: Folder) -> None:
@@ -259,7 +259,7 @@ def test_an_excel_file_is_read_like_a_table(folder: Folder) -> None:
     assert test is not None
     np.testing.assert_allclose(test.deviation * 1e3, [0, -5, -11, -8, -2.5, 3], atol=1e-9)
     assert folder.refused("t.xlsx", data, 'sheet = "Q"\n' + columns).startswith("t.xlsx:1: there is no sheet 'Q'; there are S")
-    assert folder.refused("t.xlsx", data[:200], columns).startswith("t.xlsx:1: no Excel workbook")
+    assert folder.refused("t.xlsx", data[:200], columns).startswith("t.xlsx:1: not an Excel workbook")
 
 
 def test_a_column_file_comes_back_as_it_was(folder: Folder) -> None:

@@ -84,7 +84,7 @@ GOOD = renishaw()
 WRONG = {
     "cut off": (GOOD[: GOOD.index("4   2")], "x.rtl:36: section EOF:: is missing"),
     "a row too few": (GOOD.replace("4   1      3.0\n", ""), "x.rtl:37: the deviations end here: 11 of 12"),
-    "a row too many": (GOOD.replace("\n\nEOF", "\n5   1      3.0\n\nEOF"), "x.rtl:39: a row more than 4 runs of 3 targets have"),
+    "a row too many": (GOOD.replace("\n\nEOF", "\n5   1      3.0\n\nEOF"), "x.rtl:39: more rows than 4 runs of 3 targets"),
     "rows exchanged": (GOOD.replace("1   2 ", "1   3 ", 1), "x.rtl:28: run 1, target 3, expected run 1, target 2"),
     "run forgotten": (GOOD.replace("2   3 ", "3   3 "), "x.rtl:30: run 3, target 3, expected run 2, target 3"),
     "decimal comma": (GOOD.replace("-2.5", "-2,5", 1), "x.rtl:31: the deviation is '-2,5', expected a number"),
@@ -93,7 +93,7 @@ WRONG = {
     "digits of another script": (GOOD.replace("-8.0", "٨.0", 1), "x.rtl:30: the deviation is '٨.0', expected a number"),
     "a value too few": (GOOD.replace("1   1      0.0", "1   0.0", 1), "x.rtl:27: 2 values, expected run, target and deviation"),
     "targets fewer than counted": (GOOD.replace("100.0000  ", ""), "x.rtl:6: 2 targets, Target-count says 3"),
-    "targets go back": (GOOD.replace("100.0000", "300.0000"), "x.rtl:6: targets have to rise or to fall"),
+    "targets go back": (GOOD.replace("100.0000", "300.0000"), "x.rtl:6: expected two or more targets, all rising or all falling"),
     "unknown flags": (GOOD.replace("0 0 2 0", "0 0 1 0"), "x.rtl:11: Flags '0 0 1 0' are not known"),
     "flags contradict the rows": (GOOD.replace("0 0 2 0", "0 1 2 0"), "x.rtl:30: run 2 is read back, but the flags say one direction"),
     "an odd run": (GOOD.replace("Run-count:4", "Run-count:3"), "x.rtl:23: Run-count is 3: a test in both directions has an even number"),

@@ -128,7 +128,7 @@ async def test_a_table_that_is_switched_off_is_told_before_anything_is_mounted(
 
     monkeypatch.setattr(work, "read_base", base)
     session: Any = SimpleNamespace(controller=SimpleNamespace(status=status))
-    with pytest.raises(TableMismatch, match="0000005A does not act") if refused else nullcontext():
+    with pytest.raises(TableMismatch, match="0000005A has no effect") if refused else nullcontext():
         await work._check_table_acts(session)
 
 
