@@ -147,7 +147,7 @@ def test_what_is_wrong_in_a_rtx(folder: Folder) -> None:
     assert folder.refused("d.rtx", rtx(count=4)).startswith("d.rtx:19: 31 bytes follow, but 4 samples")
     assert folder.refused("d.rtx", rtx((0.0, float("nan")))).startswith("d.rtx:19: sample 2 is ")
     assert folder.refused("d.rtx", rtx(rate="50 kHz")).startswith("d.rtx:8: Actual sample rate is '50 kHz', expected a number")
-    assert folder.refused("d.rtx", b"HEADER::\r\n").startswith("d.rtx:1: no .rtx")
+    assert folder.refused("d.rtx", b"HEADER::\r\n").startswith("d.rtx:1: not an .rtx file")
 
 
 def test_a_table_with_a_column_file(folder: Folder) -> None:
