@@ -32,7 +32,7 @@ def only_artefacts(joint: JointSolution) -> bool:
 
 def artefact_lines(joint: JointSolution) -> list[str]:
     """Return the errors that the poses of an artefact hide, the pose that would show them, their share of the named fields, and a separate
-    rigid fit of every workpiece."""
+    fit of every workpiece."""
     rank = pose_rank(joint.data)
     told = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
     return told + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
