@@ -78,7 +78,8 @@ def slots_between(schedule: Schedule, after_utc: datetime, until_utc: datetime) 
 def rule_as_text(schedule: Schedule) -> str:
     """Return the schedule as a sentence, for people."""
     if schedule.every_h:
-        return f"Every {schedule.every_h:g} hours, counted from {schedule.first.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
+        every = f"{schedule.every_h:g} hours" if schedule.every_h >= 1.0 else f"{60.0 * schedule.every_h:.3g} minutes"
+        return f"Every {every}, counted from {schedule.first.astimezone(UTC):%Y-%m-%d %H:%M} UTC"
     return CronSim(schedule.cron, datetime(2026, 1, 1, tzinfo=UTC)).explain()
 
 

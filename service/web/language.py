@@ -1,6 +1,6 @@
 """The texts of the screens in four languages: one catalogue file each, all with the same keys and placeholders.
 
-Stored sentences (verdicts, refusals, remarks of reports) stay in English.
+Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.service.web.phrases` tells those that it knows.
 """
 
 from __future__ import annotations

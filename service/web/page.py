@@ -18,6 +18,7 @@ from abbe.service.queries.status import Status
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
+from abbe.service.web.phrases import phrase, pictured
 from abbe.service.web.strip import strip_of
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted
@@ -82,7 +83,8 @@ def environment() -> Environment:
     env.filters["lengths"] = _lengths
     env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
     # Pictures come from our own SVG writer, which has escaped every text.
-    env.filters["picture"] = Markup
+    env.filters["picture"] = lambda svg: pictured(current().lang, svg)
+    env.filters["say"] = lambda text: phrase(current().lang, str(text))
     env.globals |= template_functions() | {"step_address": step_address, "has_uplot": has_uplot, "plot_files": plot_files}
     return env
 
@@ -188,11 +190,11 @@ def sentence(check: Verification) -> str:
     """What a check says of the machine, in the reader's words; a verdict with another reason than its figures keeps its stored sentence."""
     frame = current()
     if check.cause is not None:
-        return f"{frame.translate('check.stopped')} {check.cause.what}"
+        return f"{frame.translate('check.stopped')} {phrase(frame.lang, check.cause.what)}"
     verdicts = own_verdicts(check)
     named = [name for name, verdict in verdicts.items() if verdict == check.verdict]
     if not named or (check.verdict == "pass" and len(named) < len(verdicts)) or (check.verdict != "fail" and "fail" in verdicts.values()):
-        return check.text
+        return phrase(frame.lang, check.text)
     names = ", ".join(language.figure(frame.lang, name)[0] for name in named)
     return frame.translate(f"check.{check.verdict}", names=names)
 

@@ -34,7 +34,7 @@ def test_a_check_that_could_not_be_completed_says_why_and_what_to_do(running: Se
     with as_user(running, "olga", **{"Accept-Language": "ja"}) as client:
         shown = text(client.get("/check?id=22").text)
         assert "点検は完了しませんでした。" in shown
-        assert "is the laser on?" in shown
+        assert "レーザーの電源は入っていますか。" in shown
         assert "測定データが保存されていません" in shown
         assert client.get("/check?id=999").status_code == 404
         assert 'href="/check?id=24"' in client.get("/").text
