@@ -162,6 +162,7 @@ class Discovery:
     confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
+    alone : the result without any effect, if chance also gives names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
     left_out : gap of the fitted runs on blocks that are left out in turn (`abbe.models.discovery.left_out`); None if holdout runs judge.
     residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
     predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
@@ -198,3 +199,4 @@ class Discovery:
     fitted: tuple[Fitted, ...] = ()
     doubt: str = ""
     left_out: Gap | None = None
+    alone: Discovery | None = None

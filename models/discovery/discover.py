@@ -17,6 +17,7 @@ from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.finding import doubted, finding
 from abbe.models.discovery.instrument_noise import unscaled
+from abbe.models.discovery.lack import CHANCE
 from abbe.models.discovery.mixed_up import mixed_up, wrong_tool
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
 from abbe.models.discovery.solved_model import predictions, solve
@@ -119,7 +120,10 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     solved = solve(problem, picks)
     after = predictions(problem, solved) if picks else before
     tell("what else it could be", 0.95)
-    return finding(problem, plain, found, loud, solved, rivals, (before, after))
+    named = finding(problem, plain, found, loud, solved, rivals, (before, after))
+    if named.verdict != "named" or named.p_value < CHANCE:
+        return named
+    return replace(named, alone=finding(plain, plain, (), (), solve(plain, ()), (), (before, before)))
 
 
 def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:

@@ -34,6 +34,8 @@ def finding_of(
 ) -> Finding:
     """Build the finding of a discovery, including the result of the holdout runs.
 
+    Names that chance also gives, and that holdout runs refute, are none if the present model explains all runs without them.
+
     ``known_mm``: contribution of the model book's effects, mm by run label, which was subtracted before the search and is added to the
     predictions again. ``thinning``: the decimation of long runs; None without any.
     """
@@ -67,7 +69,10 @@ def finding_of(
             covariance=PackedCovariance.of(found.theta_covariance),
         ),
     )
-    return with_proof(finding)
+    proof = with_proof(finding)
+    if proof.suspects and found.alone is not None and found.alone.verdict == "none":
+        return replace(finding_of(found.alone, case, effects, known_mm, thinning), rejected=proof.rejected)
+    return proof
 
 
 def effect_found(named: NamedEffect, effect: Effect, by_name: Mapping[str, Effect]) -> EffectFound:

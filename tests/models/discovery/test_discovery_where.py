@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from abbe.models.arrays import F1
+from abbe.models.discovery.lack import CHANCE
 from abbe.models.discovery.localization import SIGNIFICANT, localize_signal, locate
 from tests.models.discovery.discovery_paths import campaign, noise
 
@@ -42,6 +43,18 @@ def test_one_run_in_time() -> None:
     assert where.time_s is not None
     assert where.time_s[0] >= run[0] - 30.0
     assert where.time_s[1] <= run[-1] + 30.0
+
+
+@pytest.mark.parametrize(("sigma", "seen"), [(5.0, False), (9.0, True)])
+def test_one_spectral_line_of_a_short_run_must_be_stronger_than_chance_gives(sigma: float, seen: bool) -> None:
+    """Readings that alternate: five sigma of it come by chance in one of some hundred clean campaigns."""
+    short = min((k for k, p in enumerate(PATHS) if p.n >= 40), key=lambda k: PATHS[k].n)
+    n = PATHS[short].n
+    line = (-1.0) ** np.arange(n) / np.sqrt(n)
+    rest = list(noise(PATHS, 2))
+    rest[short] += (sigma - rest[short] @ line) * line
+    found = next(s for s in locate(PATHS, tuple(rest)).table if s.value == f"{PATHS[short].label} (neighbours)")
+    assert (found.p < CHANCE) is seen
 
 
 def test_wave_on_the_clock() -> None:

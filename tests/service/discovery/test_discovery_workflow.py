@@ -15,7 +15,7 @@ from typing import Any
 
 import pytest
 
-from abbe.models.discovery.answer import Agreement, BlindSpot, Gap, NextTest, Unjudged
+from abbe.models.discovery.answer import Agreement, BlindSpot, Discovery, Gap, NextTest, Unjudged
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
 from abbe.service.discovery.discovery_answer import answer_doc
@@ -139,6 +139,18 @@ def test_a_name_that_is_taken_back_is_a_suspect_in_text_answer_and_page(folder: 
     assert not any("What to do" in str(section) for section in page["sections"])
     rejected = next(t for t in page["tables"] if t["title"].startswith("What was tried and why not"))
     assert rejected["rows"][0][0] == "backlash:X"
+
+
+def test_a_name_of_little_evidence_that_the_judges_refute_leaves_nothing_missing(folder: Path) -> None:
+    """If the present model explains all runs without it; otherwise it stays a suspect."""
+
+    def search(*given: Any) -> Discovery:
+        return replace(Search(holds=False)(*given), alone=Search("none")(*given))
+
+    found = discover(job_of(folder), DiscoveryJournal(), search, ignore_progress)
+    assert (found.verdict, found.effects, found.suspects) == ("none", (), ())
+    assert found.rejected[0][0] == "backlash:X"
+    assert found.gaps["holdout"].after_um == found.gaps["holdout"].before_um
 
 
 def test_the_answer_says_what_is_proved_and_by_which_rule(folder: Path) -> None:
