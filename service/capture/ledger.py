@@ -113,15 +113,25 @@ class Ledger:
                 at = max(at, last + 1)
         return count
 
+    @property
+    def in_gaps(self) -> int:
+        """Number of samples known to be missing."""
+        return sum(gap.missing for gap in self.gaps)
+
+    @property
+    def uncovered(self) -> int:
+        """Number of samples that no entry covers."""
+        return sum(last - first + 1 for _, first, last in self.unaccounted())
+
     def doc(self) -> dict[str, Any]:
         """Return the totals as JSON object."""
         return {
             "stored_valid": self.stored - self.invalid,
             "stored_flagged": self.invalid,
             "flags": dict(self.flagged),
-            "in_gaps": sum(gap.missing for gap in self.gaps),
+            "in_gaps": self.in_gaps,
             "gaps": len(self.gaps),
-            "unaccounted": sum(last - first + 1 for _, first, last in self.unaccounted()),
+            "unaccounted": self.uncovered,
         }
 
     def _covered(self, stream: int) -> list[tuple[int, int]]:

@@ -12,6 +12,7 @@ from collections.abc import AsyncIterator, Mapping
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Self
 
 from abbe.drivers.errors import run_to_end
 from abbe.models.machine import Machine
@@ -39,13 +40,20 @@ class SimulatorProcess:
 
     machine: Machine
     urls: DeviceUrls
-    pid: int
     artefact: ArtefactObject | None = None
+
+    @classmethod
+    def of_line(cls, line: str | bytes) -> Self:
+        """Parse the line that the simulators print once they answer. Raises ValueError."""
+        ready = parsed(_Ready, json.loads(line))
+        urls = DeviceUrls(ready.cnc, ready.ballbar, ready.laser, ready.fixture)
+        plate = None if ready.artefact is None else ArtefactObject.read(ready.artefact)
+        return cls(machine_from_doc(ready.machine), urls, plate)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _Ready:
-    """The line that the simulators print once they answer."""
+    """The keys of that line."""
 
     machine: Doc
     cnc: str
@@ -103,15 +111,12 @@ async def running_simulators(args: list[str]) -> AsyncIterator[SimulatorProcess]
         start_new_session=True,  # Ctrl-C reaches only this process, which stops the axes before the simulators
     )
     try:
-        ready = await _ready(process)
-        urls = DeviceUrls(ready.cnc, ready.ballbar, ready.laser, ready.fixture)
-        plate = None if ready.artefact is None else ArtefactObject.read(ready.artefact)
-        yield SimulatorProcess(machine_from_doc(ready.machine), urls, process.pid, plate)
+        yield await _ready(process)
     finally:
         await run_to_end(_end(process))
 
 
-async def _ready(process: asyncio.subprocess.Process) -> _Ready:
+async def _ready(process: asyncio.subprocess.Process) -> SimulatorProcess:
     assert process.stdout is not None
     assert process.stderr is not None
     try:
@@ -120,7 +125,7 @@ async def _ready(process: asyncio.subprocess.Process) -> _Ready:
     except TimeoutError:
         raise SimulatorError(f"the simulators were not ready within {READY_S:g} s", "this computer may be overloaded: try again") from None
     try:
-        return parsed(_Ready, json.loads(line))
+        return SimulatorProcess.of_line(line)
     except ValueError:
         errors = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
         raise SimulatorError(f"the simulators did not start: {errors[-1] if errors else 'no reason given'}", "check the scenario") from None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -17,6 +18,7 @@ _OTHER_HEAD = re.compile(r"\s*Position\s+[A-Z]", re.ASCII)
 _WAYS = {"Bidirectional": 0.0, "Forward Directional": 1.0, "Reverse Directional": -1.0, "Backward Directional": -1.0}
 _REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined", re.ASCII)
 _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", "compensation end": "end"}
+"""Words of a line of a .REN, and the field of `_Grid` that it gives."""
 _UNITS = re.compile(r"(?<![A-Za-z])(millimet(?:re|er)s?|micromet(?:re|er)s?|microns?|mm|um|µm|μm|nm)(?![A-Za-z/])", re.IGNORECASE)
 NEAR = 1e-6
 """Largest relative difference of a position of a .REN from its start, spacing and number."""
@@ -129,7 +131,7 @@ def read_ren(name: str, data: bytes) -> Content:
         raise file.wrong(
             line, "spacing, start, end or the table 'No. Axis position Combined' is missing: the file is cut off, or not a .REN"
         )
-    _check_spacing(file, line, facts, np.array(positions))
+    _check_spacing(file, line, _Grid(**facts), np.array(positions))
     known = len(unit) == 1
     factor = LENGTHS[next(iter(unit))] if known else 1.0
     test = AxisReadings(
@@ -171,12 +173,21 @@ def _unit(word: str) -> str:
     return "nm" if word == "nm" else "mm" if word.startswith(("mm", "milli")) else "um"
 
 
-def _check_spacing(file: TextFile, last: int, facts: Mapping[str, float], position: F1) -> None:
-    wanted = facts["start"] + facts["spacing"] * np.arange(position.size)
-    off = np.flatnonzero(np.abs(position - wanted) > NEAR * max(1.0, abs(facts["end"] - facts["start"])))
-    if facts["spacing"] == 0.0 or off.size or abs(wanted[-1] - facts["end"]) > NEAR * max(1.0, abs(facts["end"])):
+@dataclass(frozen=True, slots=True)
+class _Grid:
+    """The positions that a .REN states, mm."""
+
+    spacing: float
+    start: float
+    end: float
+
+
+def _check_spacing(file: TextFile, last: int, grid: _Grid, position: F1) -> None:
+    wanted = grid.start + grid.spacing * np.arange(position.size)
+    off = np.flatnonzero(np.abs(position - wanted) > NEAR * max(1.0, abs(grid.end - grid.start)))
+    if grid.spacing == 0.0 or off.size or abs(wanted[-1] - grid.end) > NEAR * max(1.0, abs(grid.end)):
         at = last - position.size + 1 + (int(off[0]) if off.size else position.size - 1)
-        told = f"from {facts['start']:g} to {facts['end']:g} in steps of {facts['spacing']:g}"
+        told = f"from {grid.start:g} to {grid.end:g} in steps of {grid.spacing:g}"
         raise file.wrong(at, f"{position.size} positions do not go {told}, as the file says")
 
 

@@ -31,6 +31,14 @@ _AIR_HPA = (600.0, 1100.0)
 Lines = list[tuple[int, str]]
 
 
+@dataclass(frozen=True, slots=True)
+class _Section:
+    """Line of the heading, and the lines below it."""
+
+    at: int
+    lines: Lines
+
+
 @dataclass
 class _Sections:
     """Lines by section, the line of each heading, and the last line of the file."""
@@ -39,6 +47,30 @@ class _Sections:
     lines: dict[str, Lines] = field(default_factory=dict)
     at: dict[str, int] = field(default_factory=dict)
     last: int = 1
+
+    @property
+    def header(self) -> _Section:
+        """What the file is."""
+        return self.section("HEADER")
+
+    @property
+    def target_data(self) -> _Section:
+        """The targets."""
+        return self.section("TARGET DATA")
+
+    @property
+    def runs(self) -> _Section:
+        """The number of runs."""
+        return self.section("RUNS")
+
+    @property
+    def deviations(self) -> _Section:
+        """The readings."""
+        return self.section("DEVIATIONS")
+
+    def section(self, name: str) -> _Section:
+        """A section that every file has (`_NEEDED`)."""
+        return _Section(self.at[name], self.lines[name])
 
 
 def read_renishaw(name: str, data: bytes) -> Content:
@@ -51,8 +83,9 @@ def read_renishaw(name: str, data: bytes) -> Content:
     """
     file = text_file(name, data)
     parts = _sections(file)
-    head = _facts(file, parts.lines["HEADER"])
-    _, quantity, unit = _kind(parts, head)
+    head = _facts(file, parts.header.lines)
+    kind = head.get("file type", "").lower()
+    _, quantity, unit = _kind(parts, kind, head.get("owner", ""))
     targets, both = _targets(parts)
     rows, words = _rows(parts, targets.size, _run_count(parts, both=both))
     notes = [f"section {one} (line {at}) is not known and was not read" for one, at in parts.at.items() if one not in _READ]
@@ -75,7 +108,7 @@ def read_renishaw(name: str, data: bytes) -> Content:
     said = {key.capitalize(): value for key, value in (head | user).items() if value} | read
     return Content(
         name=name,
-        form=f"Renishaw .{head['file type'].lower()}",
+        form=f"Renishaw .{kind}",
         sha256=digest(data),
         machine=user.get("machine", ""),
         said=said,
@@ -120,21 +153,20 @@ def _facts(file: TextFile, lines: Lines) -> dict[str, str]:
     return out
 
 
-def _kind(parts: _Sections, head: Mapping[str, str]) -> tuple[str, str, float]:
-    at = parts.at["HEADER"]
-    kind = head.get("file type", "").lower()
+def _kind(parts: _Sections, kind: str, owner: str) -> tuple[str, str, float]:
+    at = parts.header.at
     if kind not in KINDS:
         what = f"the file type is {kind!r}" if kind else "'File type' is missing"
         raise parts.file.wrong(at, f"{what}, expected rtl or rta", "only tests of positioning and of angle can be read")
-    if head.get("owner", "").lower() != KINDS[kind][0]:
-        raise parts.file.wrong(at, f"the owner is {head.get('owner', '')!r}, expected {KINDS[kind][0]!r} in a .{kind}")
+    if owner.lower() != KINDS[kind][0]:
+        raise parts.file.wrong(at, f"the owner is {owner!r}, expected {KINDS[kind][0]!r} in a .{kind}")
     return KINDS[kind]
 
 
 def _targets(parts: _Sections) -> tuple[F1, bool]:
     """The targets, mm, and whether they were approached from both sides."""
-    file, at, lines, values = parts.file, parts.at["TARGET DATA"], dict[str, tuple[int, str]](), list[float]()
-    for line, text in parts.lines["TARGET DATA"]:
+    file, at, lines, values = parts.file, parts.target_data.at, dict[str, tuple[int, str]](), list[float]()
+    for line, text in parts.target_data.lines:
         key, colon, rest = text.partition(":")
         name = " ".join(key.split()).lower()
         known = name in ("target-count", "targets", "flags") and name not in lines if colon else "targets" in lines and "flags" not in lines
@@ -169,8 +201,8 @@ def _whole(file: TextFile, line: int, word: str, what: str) -> int:
 
 
 def _run_count(parts: _Sections, *, both: bool) -> int:
-    file, lines = parts.file, parts.lines["RUNS"]
-    at = lines[0][0] if lines else parts.at["RUNS"]
+    file, lines = parts.file, parts.runs.lines
+    at = lines[0][0] if lines else parts.runs.at
     if len(lines) != 1 or not re.match(r"run-count\s*:", lines[0][1], re.IGNORECASE):
         raise file.wrong(at, "RUNS:: has to hold one line, Run-count")
     count = _whole(file, at, lines[0][1].partition(":")[2].strip(), "Run-count")
@@ -185,9 +217,9 @@ Row = tuple[int, int, int, float]
 
 def _rows(parts: _Sections, targets: int, runs: int) -> tuple[list[Row], list[str]]:
     """The deviations in order, checked against the numbers of targets and runs; and the words of their values."""
-    file, lines = parts.file, parts.lines["DEVIATIONS"]
+    file, lines = parts.file, parts.deviations.lines
     if not lines or " ".join(lines[0][1].split()).lower() != "run target data:":
-        raise file.wrong(lines[0][0] if lines else parts.at["DEVIATIONS"], "expected the line 'Run Target Data:'")
+        raise file.wrong(lines[0][0] if lines else parts.deviations.at, "expected the line 'Run Target Data:'")
     out, words = list[Row](), list[str]()
     for k, (line, text) in enumerate(lines[1:]):
         cells = text.split()

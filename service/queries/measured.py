@@ -9,12 +9,12 @@ from dataclasses import dataclass, fields
 from abbe.drivers.api import BarSample
 from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import MachineObject
-from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord, RunFacts, RunRecord
+from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord, Owner, RunFacts, RunRecord, visible_status
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable
 from abbe.service.runs.columns import BAR_CODEC, IMPORTED_CHANNEL, JSON_CODEC, decode_bar, decode_json, pack_bar, run_document, whole_run
 from abbe.service.sequences.journal import Trouble, not_written, troubles
-from abbe.service.storage.repositories.pages import visible_status
+from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.storage.store import Store
 
 MOST_RUNS = 10_000
@@ -85,8 +85,8 @@ def machine(reader: Reader, number: int) -> MachineDescription:
     return _machine(reader.row("machines", number, "machine"))
 
 
-def _machine(row: Doc) -> MachineDescription:
-    return of_row(MachineDescription, row, description=read_as(MachineObject, row["doc"]))
+def _machine(row: PageRow) -> MachineDescription:
+    return of_row(MachineDescription, row, description=read_as(MachineObject, row.doc))
 
 
 def campaigns(reader: Reader, machine: str | None, cursor: int | None, limit: int) -> tuple[list[CampaignSummary], int | None]:
@@ -98,10 +98,10 @@ def campaigns(reader: Reader, machine: str | None, cursor: int | None, limit: in
 def campaign(reader: Reader, number: int) -> CampaignDetail:
     """Return a campaign with its runs. Raises NotStored."""
     row = reader.row("campaigns", number, "campaign")
-    filters = {"campaign": row["name"]}
+    filters = {"campaign": reader.store.campaigns.find(number).name}
     runs = [_run(one) for one in reversed(reader.store.pages.page("runs", filters, None, MOST_RUNS))]
     solutions, discoveries = (
-        [one["id"] for one in reader.store.pages.page(kind, filters, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
+        [one.number for one in reader.store.pages.page(kind, filters, None, MOST_RESULTS)] for kind in ("solutions", "discoveries")
     )
     journal = reader.store.checkpoints.of_campaign(number)
     known = {"incidents": troubles(journal) if journal else None, "incidents_not_written": not_written(journal)}
@@ -131,10 +131,9 @@ def runs_by_state(reader: Reader, campaign: str, test: str, state: str, limit: i
 
 def run(reader: Reader, number: int) -> RunDetail:
     """Return one run with its channels. Raises NotStored."""
-    row = reader.row("runs", number, "run")
-    end = reader.store.runs.find(number).end_doc or {}
-    state = visible_status(row)
-    known = {"run_id": row["label"], "status": state, "reason": _reason(state, row["reason"], end)}
+    row, record = reader.row("runs", number, "run"), reader.store.runs.find(number)
+    state, end = record.visible_status, record.end_doc or {}
+    known = {"status": state, "reason": _reason(state, record.reason, end)}
     return of_row(RunDetail, row, **known, channels=reader.store.chunks.channels(number), gaps=len(end.get("gaps") or []))
 
 
@@ -148,14 +147,26 @@ def all_runs(store: Store, campaign: str | None = None) -> list[RunSummary]:
 
 def run_summary(record: RunRecord, machine: str) -> RunSummary:
     """Return the summary of a full record of a run."""
-    row = {one.name: getattr(record, one.name) for one in fields(record)}
+    row = PageRow(record.id, {one.name: getattr(record, one.name) for one in fields(record)})
     state = record.visible_status
     return of_row(RunSummary, row, machine=machine, run_id=record.label, status=state, reason=_reason(state, record.reason, record.end_doc))
 
 
-def _run(row: Doc) -> RunSummary:
-    state = visible_status(row)
-    return of_row(RunSummary, row, run_id=row["label"], status=state, reason=_reason(state, row["reason"], None))
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _State:
+    """The columns of a run that tell its state."""
+
+    status: str
+    reason: str
+    owner_host: str
+    owner_pid: int
+    owner_start: str
+
+
+def _run(row: PageRow) -> RunSummary:
+    found = of_row(_State, row)
+    state = visible_status(found.status, Owner(found.owner_host, found.owner_pid, found.owner_start))
+    return of_row(RunSummary, row, status=state, reason=_reason(state, found.reason, None))
 
 
 def _reason(state: str, reason: str, end: Doc | None) -> str:

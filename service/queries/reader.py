@@ -16,6 +16,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from abbe.service.clock import Clock
 from abbe.service.errors import NotStored, StoreError, Unusable
+from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.storage.store import Store
 
 T = TypeVar("T")
@@ -54,14 +55,16 @@ class Reader:
         """Return the identity of a machine's control; empty for machines of other services."""
         return self.control if machine == self.machine else ""
 
-    def page(self, kind: str, filters: Mapping[str, object], cursor: int | None = None, limit: int = MOST) -> tuple[list[Doc], int | None]:
+    def page(
+        self, kind: str, filters: Mapping[str, object], cursor: int | None = None, limit: int = MOST
+    ) -> tuple[list[PageRow], int | None]:
         """Return the rows of a page, newest first, and the cursor of the next page; None: this is the last page."""
         if any(isinstance(value, str) and not storable(value) for value in filters.values()):
             return [], None
         rows = self.store.pages.page(kind, filters, cursor, limit + 1)
-        return rows[:limit], rows[limit - 1]["id"] if len(rows) > limit else None
+        return rows[:limit], rows[limit - 1].number if len(rows) > limit else None
 
-    def row(self, kind: str, number: int, what: str) -> Doc:
+    def row(self, kind: str, number: int, what: str) -> PageRow:
         """Return one row with its document; ``what`` names the thing in the error. Raises NotStored."""
         found = self.store.pages.row(kind, number)
         if found is None:
@@ -79,9 +82,9 @@ class StoredResult:
     created_utc: str
 
 
-def of_row(kind: type[T], row: Mapping[str, Any], **known: Any) -> T:
-    """Convert a row of the store to a record: fields have the names of columns, ``number`` is ``id``; ``known`` overrides the row."""
-    values = {"number": row["id"], **row, **known}
+def of_row(kind: type[T], row: PageRow, **known: Any) -> T:
+    """Convert a row of the store to a record: fields have the names of columns; ``known`` overrides the row."""
+    values = {"number": row.number, "id": row.number, "doc": row.doc, **row.columns, **known}
     return kind(**{one.name: values[one.name] for one in fields(kind) if one.name in values})  # type: ignore[arg-type]
 
 

@@ -16,6 +16,7 @@ from abbe.service.domain.verification import Verification
 from abbe.service.errors import Unusable
 from abbe.service.identification.solution_field import node_map, stored_field
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, finite, of_row, read_as, storable
+from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.verification.trend_table import FigureChart, FigureTrend
 from abbe.service.verification.trend_table import charts as figure_charts
 from abbe.service.verification.verified_by import VerifiedBy, verified_by
@@ -97,7 +98,7 @@ def solutions(
 ) -> tuple[list[SolutionSummary], int | None]:
     """Return the solutions, newest first."""
     rows, after = reader.page("solutions", {"campaign": campaign, "machine": machine}, cursor, limit)
-    return [of_row(SolutionSummary, row, runs=row["run_ids"]) for row in rows], after
+    return [of_row(SolutionSummary, row) for row in rows], after
 
 
 def solution(reader: Reader, number: int) -> SolutionDetail:
@@ -111,10 +112,10 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
         It was stored in another form.
     """
     row = reader.row("solutions", number, "solution")
-    document = read_as(SolutionFile, row["doc"])
+    document = read_as(SolutionFile, row.doc)
     if document is None:
         raise Unusable(f"solution {number} was stored in another form than abbe-solution/1", "solve the campaign again")
-    return of_row(SolutionDetail, row, runs=row["run_ids"], document=document)
+    return of_row(SolutionDetail, row, document=document)
 
 
 def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
@@ -147,7 +148,7 @@ def discoveries(
 ) -> tuple[list[DiscoverySummary], int | None]:
     """Return the searches for missing effects, newest first."""
     rows, after = reader.page("discoveries", {"campaign": campaign, "machine": machine}, cursor, limit)
-    return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discoveries.steps(row["id"])))) for row in rows], after
+    return [of_row(DiscoverySummary, row, **_last(_states(reader.store.discoveries.steps(row.number)))) for row in rows], after
 
 
 def discovery(reader: Reader, number: int) -> DiscoveryDetail:
@@ -210,9 +211,21 @@ def latest_checks(reader: Reader, limit: int) -> list[Verification]:
     return checks(reader, reader.machine, None, None, limit)[0]
 
 
-def _check(row: Doc) -> Verification | None:
-    known = {"id": row["id"], "verdict": row["verdict"], "machine": row["machine"]}
-    return read_as(Verification, UNSCHEDULED | {"slot_utc": row["utc"], "started_utc": row["utc"]} | finite(row["doc"]) | known)
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _CheckRow:
+    """The columns of a check."""
+
+    number: int
+    machine: str
+    verdict: str
+    utc: str
+    doc: Doc
+
+
+def _check(row: PageRow) -> Verification | None:
+    found = of_row(_CheckRow, row)
+    known = {"id": found.number, "verdict": found.verdict, "machine": found.machine}
+    return read_as(Verification, UNSCHEDULED | {"slot_utc": found.utc, "started_utc": found.utc} | finite(found.doc) | known)
 
 
 def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limit: int = CHECKS) -> Trends:

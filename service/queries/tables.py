@@ -14,6 +14,7 @@ from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
 from abbe.service.errors import NotStored, Unusable
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
+from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.tables.push_journal import JournalView, TableHistory
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
@@ -84,20 +85,20 @@ def proposals(reader: Reader, machine: str | None, cursor: int | None, limit: in
     return [_summary(reader, row, statuses) for row in rows if statuses is not None], after
 
 
-def _summary(reader: Reader, row: Doc, statuses: _StatusLookup) -> ProposalSummary:
+def _summary(reader: Reader, row: PageRow, statuses: _StatusLookup) -> ProposalSummary:
     try:
         with as_stored():
-            proposed = load(reader.store, row["id"])
-            status = statuses.of(row["id"], proposed)
+            proposed = load(reader.store, row.number)
+            status = statuses.of(row.number, proposed)
     except (Unusable, NotStored) as error:
-        return of_row(ProposalSummary, row, campaign="", solution=row["solution_id"], state="changed", why=error.detail)
-    return of_row(ProposalSummary, row, **_known(row, proposed, status))
+        return of_row(ProposalSummary, row, campaign="", state="changed", why=error.detail)
+    return of_row(ProposalSummary, row, **_known(proposed, status))
 
 
-def _known(row: Doc, proposed: Proposed, status: ProposalStatus) -> Doc:
+def _known(proposed: Proposed, status: ProposalStatus) -> Doc:
     p = proposed.predicted
     predicted = PredictedRms(before=p.before_mm * 1e3, after=p.after_mm * 1e3, u_model=p.u_model_mm * 1e3)
-    known = {"solution": row["solution_id"], "campaign": proposed.campaign, "by": proposed.by, "predicted_rms_um": predicted}
+    known = {"campaign": proposed.campaign, "by": proposed.by, "predicted_rms_um": predicted}
     return known | {"state": status.word, "why": status.text}
 
 
@@ -119,7 +120,7 @@ def proposal(reader: Reader, number: int) -> ProposalDetail:
     return of_row(
         ProposalDetail,
         row,
-        **_known(row, proposed, status),
+        **_known(proposed, status),
         valid_until=utc_text(datetime.fromtimestamp(proposed.valid_until_s, UTC)),
         base_crc=f"{c.base_crc:08X}",
         generation=proposed.base.gen,
@@ -191,13 +192,13 @@ def push_entries(
     """Return the push journal, newest entry first; a renamed machine keeps its journal under the first name."""
     journal = machine and reader.store.pushes.chain(machine, reader.control_of(machine))
     rows, after = reader.page("pushes", {"machine": journal, "push": push, "state": state}, cursor, limit)
-    return [of_row(PushTransition, row, state=PushState(row["state"])) for row in rows], after
+    return [of_row(PushTransition, row, state=PushState(row.columns["state"])) for row in rows], after
 
 
 def push_entry(reader: Reader, number: int) -> PushEntry:
     """Return one entry of the journal with the facts that it recorded. Raises NotStored."""
     row = reader.row("pushes", number, "entry of a push")
-    return of_row(PushEntry, row, state=PushState(row["state"]))
+    return of_row(PushEntry, row, state=PushState(row.columns["state"]))
 
 
 def tables(reader: Reader) -> TableHistory:

@@ -45,7 +45,7 @@ def document_csv(document: Document) -> str:
     out = io.StringIO()
     write = csv.writer(out, lineterminator="\n")
     write.writerow(COLUMNS)
-    for figure in _data(document)["figures"]:
+    for figure in map(_figure, document.figures):
         # A spreadsheet would read such a cell as a formula.
         write.writerow(["'" + v if isinstance(v, str) and v[:1] in "=+@\t" and v else v for v in (figure[c] for c in COLUMNS)])
     return out.getvalue()
@@ -121,14 +121,20 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
     groups: dict[str, list[dict[str, str]]] = {}
     for f in document.figures:
         groups.setdefault(f.group, []).append(_figure_cells(f))
-    context = data | {name: _pairs(data[name]) for name in ("about", "conditions", "provenance")}
-    context["groups"] = [{"name": name, "rows": rows} for name, rows in groups.items()]
-    context["judged"] = any(f.limit is not None for f in document.figures)
-    context["not_observable"] = data["not_observable"] if document.not_observable is None else data["not_observable"] or [NOTHING_HIDDEN]
-    context["lang"], context["coverage"] = document.lang, tidy(COVERAGE)
-    context["sections"], context["appendix"] = ([_block(s, draw) for s in some] for some in (document.sections, document.appendix))
-    context["certificate"] = certificate_of(document, hashlib.sha256(document_json(document).encode(errors="replace")).hexdigest())
-    del context["figures"]
+    hidden = document.not_observable
+    context = {key: value for key, value in data.items() if key != "figures"} | {
+        "about": _pairs(document.about),
+        "conditions": _pairs(document.conditions),
+        "provenance": _pairs(document.provenance),
+        "groups": [{"name": name, "rows": rows} for name, rows in groups.items()],
+        "judged": any(f.limit is not None for f in document.figures),
+        "not_observable": None if hidden is None else list(hidden) or [NOTHING_HIDDEN],
+        "lang": document.lang,
+        "coverage": tidy(COVERAGE),
+        "sections": [_block(s, draw) for s in document.sections],
+        "appendix": [_block(s, draw) for s in document.appendix],
+        "certificate": certificate_of(document, hashlib.sha256(document_json(document).encode(errors="replace")).hexdigest()),
+    }
     clean: dict[str, Any] = _clean(context)
     return clean
 

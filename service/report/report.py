@@ -207,18 +207,22 @@ def _machine_doc(store: Store, machine: str) -> Doc:
 
 
 def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict[str, str]:
-    out = {"Begun": journal[0].utc, "Last entry": journal[-1].utc, "State": str(journal[-1].state)}
-    if known.crc != NOT_YET:
-        out["New table"] = f"CRC {known.crc:08X}, bank {known.target}"
-        out["Table before"] = f"CRC {known.base_crc:08X}, bank {known.base_bank}"
-    if known.table:
-        table = store.tables.get(known.table)
-        out["Stored as"] = f"table {table.id}" + ("" if table.solution_id is None else f", from solution {table.solution_id}")
-    out["Capability of the control"] = f"level {'unknown' if known.level == NOT_YET else known.level}" + (
-        ", a person is present" if known.attended else ""
-    )
-    found = {"Approved by": known.approved_by, "Proof of sign, axis and unit": known.probe, "Verification": known.verify}
-    return out | {name: text for name, text in found.items() if text}
+    sent, table = known.crc != NOT_YET, store.tables.get(known.table) if known.table else None
+    solution = "" if table is None or table.solution_id is None else f", from solution {table.solution_id}"
+    level = f"level {'unknown' if known.level == NOT_YET else known.level}"
+    facts = {
+        "Begun": journal[0].utc,
+        "Last entry": journal[-1].utc,
+        "State": str(journal[-1].state),
+        "New table": f"CRC {known.crc:08X}, bank {known.target}" if sent else "",
+        "Table before": f"CRC {known.base_crc:08X}, bank {known.base_bank}" if sent else "",
+        "Stored as": "" if table is None else f"table {table.id}{solution}",
+        "Capability of the control": level + (", a person is present" if known.attended else ""),
+        "Approved by": known.approved_by,
+        "Proof of sign, axis and unit": known.probe,
+        "Verification": known.verify,
+    }
+    return {name: text for name, text in facts.items() if text}
 
 
 def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:

@@ -115,16 +115,12 @@ def make_engine(url: str) -> Engine:
         The URL is wrong, the file is not a database, its folder is missing, or the driver is not installed.
     """
     parsed = parse_url(url)
-    options: dict[str, Any] = {"json_serializer": _to_json}
+    options: dict[str, Any] = {"pool_pre_ping": True}
     if parsed.drivername == "sqlite":
         _check_file(parsed)
-        options["connect_args"] = {"check_same_thread": False}
-        if not _is_sqlite_file(parsed):
-            options["poolclass"] = StaticPool
-    else:
-        options["pool_pre_ping"] = True
+        options = {"connect_args": {"check_same_thread": False}} | ({} if _is_sqlite_file(parsed) else {"poolclass": StaticPool})
     try:
-        engine = create_engine(parsed, **options)
+        engine = create_engine(parsed, json_serializer=_to_json, **options)
     except ModuleNotFoundError as err:
         raise StoreError(f"PostgreSQL needs the package {err.name!r}", "pip install 'abbe[postgres]'") from None
     if parsed.drivername == "sqlite":

@@ -78,13 +78,14 @@ def environment() -> Environment:
     env = Environment(
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
     )
-    env.filters["number"] = formatting.number
-    env.filters["length"] = lambda value, unit="µm", decimals=None: current().length(value, unit, decimals)
-    env.filters["lengths"] = _lengths
-    env.filters["span"] = lambda seconds: language.span(current().lang, seconds)
-    # Pictures come from our own SVG writer, which has escaped every text.
-    env.filters["picture"] = lambda svg: pictured(current().lang, svg)
-    env.filters["say"] = lambda text: phrase(current().lang, str(text))
+    env.filters |= {
+        "number": formatting.number,
+        "length": lambda value, unit="µm", decimals=None: current().length(value, unit, decimals),
+        "lengths": _lengths,
+        "span": lambda seconds: language.span(current().lang, seconds),
+        "picture": lambda svg: pictured(current().lang, svg),  # our own SVG writer has escaped every text
+        "say": lambda text: phrase(current().lang, str(text)),
+    }
     env.globals |= template_functions() | {"step_address": step_address, "has_uplot": has_uplot, "plot_files": plot_files}
     return env
 

@@ -128,6 +128,7 @@ def left_behind(folder: Path) -> list[str]:
 def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
     from abbe.service.config import load_machine
     from abbe.service.demo.demo import demo_site, write_machine_file
+    from abbe.service.demo.simulator_process import SimulatorProcess
     from abbe.service.site import machine_from_doc
 
     doc = {
@@ -136,7 +137,8 @@ def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
     }  # fmt: skip
     assert machine_from_doc(doc).chain == "w-X-Y-b-Z-t"
     urls = {"cnc": "modbus+tcp://127.0.0.1:1", "ballbar": "socket://127.0.0.1:2", "laser": "modbus+tcp://127.0.0.1:3"}
-    path = write_machine_file(demo_site({"machine": doc, "fixture": "fixture+tcp://127.0.0.1:4"} | urls), tmp_path)
+    ready = {"machine": doc, "fixture": "fixture+tcp://127.0.0.1:4"} | urls
+    path = write_machine_file(demo_site(SimulatorProcess.of_line(json.dumps(ready))), tmp_path)
     with path.open("a") as out:
         out.write(service_config(8123, dict.fromkeys(MARGIN_UM, 12.5)))
     machine = load_machine(path).machine

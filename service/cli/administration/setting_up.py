@@ -53,10 +53,12 @@ def init(  # noqa: PLR0913 - one option for each question
     if file.exists():
         raise ConfigError(f"{file} exists", "give the name of a new file, or change it with an editor")
     ports = sorted(str(path) for path in SERIAL_PORTS.glob("*"))
-    doc: dict[str, Any] = {"name": _asked(name, "name of the machine", "mill-1", str, "--name")}
-    doc["chain"] = _asked(chain, "carriages from the workpiece (w) over the bed (b) to the tool (t)", "w-X-Y-b-Z-t", str, "--chain")
-    doc["stroke_mm"] = _asked(strokes, "strokes of X, Y and Z in mm", "0..600,0..500,0..450", _strokes, "--strokes")
-    doc["tool_mm"] = _asked(tool, "from the spindle's reference point to the ball, mm", "0,0,-120", _point, "--tool")
+    doc: dict[str, Any] = {
+        "name": _asked(name, "name of the machine", "mill-1", str, "--name"),
+        "chain": _asked(chain, "carriages from the workpiece (w) over the bed (b) to the tool (t)", "w-X-Y-b-Z-t", str, "--chain"),
+        "stroke_mm": _asked(strokes, "strokes of X, Y and Z in mm", "0..600,0..500,0..450", _strokes, "--strokes"),
+        "tool_mm": _asked(tool, "from the spindle's reference point to the ball, mm", "0,0,-120", _point, "--tool"),
+    }
     port = f"serial://{ports[0]}?baud=460800" if ports else "-"
     urls = {
         "cnc": _asked(cnc, "address of the controller, e.g. modbus+tcp://192.168.0.10:502 (none: -)", "-", _url, "--cnc"),

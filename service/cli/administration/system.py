@@ -86,11 +86,12 @@ def _write_machine_file(line: bytes, file: Path, *, as_json: bool) -> None:
 
     from abbe.service.clock import SystemClock
     from abbe.service.demo.demo import demo_site, machine_file_of
+    from abbe.service.demo.simulator_process import SimulatorProcess
     from abbe.service.rendering.page_file import write_page
 
     if not line.strip():
         return
-    site, day = demo_site(json.loads(line)), SystemClock().utc().date() + timedelta(days=SIMULATED_DAYS)
+    site, day = demo_site(SimulatorProcess.of_line(line)), SystemClock().utc().date() + timedelta(days=SIMULATED_DAYS)
     write_page(machine_file_of(replace(site, calibrated_until=dict.fromkeys(site.calibrated_until, day))), file)
     typer.echo(line.decode().rstrip())
     conclude("abbe doctor", machine=None if file == Path(DEFAULT_MACHINE) else file, as_json=as_json)

@@ -74,15 +74,15 @@ def runs(
     from abbe.service.queries.reader import json_value
 
     with open_store(database_url(db, machine)) as store:
-        found = [json_value(run) for run in all_runs(store, campaign)]
+        found = all_runs(store, campaign)
     if as_json:
-        print_json(found)
+        print_json([json_value(run) for run in found])
         return
     keys = ("number", "campaign", "machine", "run_id", "test", "role", "status", "reason", "started_utc", "ended_utc")
     heads = ("number", "campaign", "machine", "run", "test", "role", "status", "reason", "started (UTC)", "ended (UTC)")
-    print_table(heads, [[str(run[key] or "") for key in keys] for run in found])
-    complete = sum(run["status"] == "complete" for run in found)
-    then = f"abbe show {quote(found[-1]['campaign'] + '/' + found[-1]['run_id'])}" if found else "abbe measure --dry-run"
+    print_table(heads, [[str(getattr(run, key) or "") for key in keys] for run in found])
+    complete = sum(run.status == "complete" for run in found)
+    then = f"abbe show {quote(f'{found[-1].campaign}/{found[-1].run_id}')}" if found else "abbe measure --dry-run"
     conclude(then, machine=machine, db=db, verdict=f"{len(found)} runs, {complete} complete")
 
 
@@ -140,12 +140,14 @@ def _samples(run: RunRecord, chunks: list[ChunkRecord]) -> dict[str, str]:
     ledger = ledger_of(chunks, streams)
     if not ledger.stored and not ledger.gaps:
         return {}
-    sums = ledger.doc()
-    flags = ", ".join(f"{reason} {sums['flags'][reason]}" for reason in BAR_REASONS if reason in sums["flags"])
-    rows = {"samples": f"{sums['stored_valid']} valid, {sums['stored_flagged']} flagged" + (f" ({flags})" if flags else "")}
-    rows["missing"] = f"{sums['in_gaps']} in {sums['gaps']} gaps" + (f", {sums['unaccounted']} unaccounted" if sums["unaccounted"] else "")
+    flags = ", ".join(f"{reason} {ledger.flagged[reason]}" for reason in BAR_REASONS if reason in ledger.flagged)
+    unaccounted = f", {ledger.uncovered} unaccounted" if ledger.uncovered else ""
+    rows = {
+        "samples": f"{ledger.stored - ledger.invalid} valid, {ledger.invalid} flagged" + (f" ({flags})" if flags else ""),
+        "missing": f"{ledger.in_gaps} in {len(ledger.gaps)} gaps{unaccounted}",
+    }
     if (count := len(ledger.ends())) > 1:
-        rows["streams"] = str(count) if streams is not None else f"{count} (guessed: the run does not say)"
+        rows |= {"streams": str(count) if streams is not None else f"{count} (guessed: the run does not say)"}
     for number, gap in enumerate(ledger.gaps, start=1):
         last = "?" if gap.last is None else str(gap.last)
         rows[f"gap {number}"] = f"samples {gap.first} to {last}: {gap.cause}"

@@ -191,9 +191,9 @@ def _document(sources: Sources, kind: ReportKind, number: int, machine: str | No
         ReportKind.VERIFICATION: "verifications",
         ReportKind.DISCOVERY: "discoveries",
     }[kind]
-    row = reader.row(listing, number, kind)
+    reader.row(listing, number, kind)
     if kind is ReportKind.RUN:
-        return stored_report(store, store.runs.find(f"{row['campaign']}/{row['label']}"), sources.rules)
+        return stored_report(store, store.runs.find(number), sources.rules)
     if kind is ReportKind.CAMPAIGN:
-        return stored_report(store, store.campaigns.find(row["name"]), sources.rules)
+        return stored_report(store, store.campaigns.find(number), sources.rules)
     return numbered_report(store, kind, number, sources.rules)

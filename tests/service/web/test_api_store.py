@@ -16,13 +16,13 @@ def test_pages_of_everything(url: str) -> None:
             campaign = store.campaigns.add(machine, name, {"big": "x"})
             for k in range(5):
                 store.runs.finish(store.runs.start(campaign, f"r{k}", "laser_linear", "identify", {}), "complete", "", None)
-        assert [row["label"] for row in store.pages.page("runs", {"campaign": "b", "machine": "m"}, None, 3)] == ["r4", "r3", "r2"]
-        assert [row["id"] for row in store.pages.page("runs", {"role": "identify"}, 4, 100)] == [3, 2, 1]
+        assert [row.columns["run_id"] for row in store.pages.page("runs", {"campaign": "b", "machine": "m"}, None, 3)] == ["r4", "r3", "r2"]
+        assert [row.number for row in store.pages.page("runs", {"role": "identify"}, 4, 100)] == [3, 2, 1]
         assert store.pages.page("runs", {"campaign": "' OR 1=1 --"}, None, 3) == []
         for kind in LISTINGS:
             assert isinstance(store.pages.page(kind, dict.fromkeys(LISTINGS[kind].filters, None), None, 10), list)
             assert store.pages.row(kind, 77) is None
-        assert store.pages.row("campaigns", 1)["doc"] == {"big": "x"}
+        assert store.pages.row("campaigns", 1).doc == {"big": "x"}
         solution = store.solutions.add(1, "joint", [1], {})
         number = store.proposals.add("m", solution, {"n": 1}, "d")
         store.proposals.reject(ProposalRejection(proposal_id=number, name="somebody", login="user:somebody", reason="too warm"))
