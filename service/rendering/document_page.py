@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 from collections.abc import Callable
 from functools import cache
@@ -28,6 +29,13 @@ FONT = "Libertinus Serif"
 """Bundled with the typesetter, so that a report looks the same on every computer."""
 
 
+CJK = ("Noto Sans CJK JP", "Noto Sans CJK KR", "Noto Sans CJK SC")
+FONTS = ("/usr/share/fonts/opentype/noto", "/usr/share/fonts/truetype/noto", "/usr/local/share/fonts")
+"""Where Debian's `fonts-noto-cjk` and people put fonts for Chinese, Japanese and Korean; `ABBE_FONTS` names another folder."""
+NO_FONT = "Letters of this report have no font on this computer: install fonts-noto-cjk, or name a folder in ABBE_FONTS."
+_EAST = re.compile("[\u1100-\u11ff\u2e80-\ua4cf\uac00-\ud7ff\uf900-\ufaff\uff00-\uffef]")
+
+
 def document_html(document: Document) -> str:
     """Self-contained page without scripts or requests. Equal reports give equal bytes."""
     mark = "" if document.verdict is None else _MARKS[document.verdict[0]]
@@ -36,13 +44,20 @@ def document_html(document: Document) -> str:
 
 
 def document_pdf(document: Document) -> bytes:
-    """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes."""
+    """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
+
+    Chinese, Japanese and Korean letters need a font of the computer; without one the report says so.
+    """
     import typst
 
     data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
+    folders: list[str | Path | bytes] = []
+    if _EAST.search(json.dumps(data, ensure_ascii=False)):
+        folders += [one for one in (os.environ.get("ABBE_FONTS", ""), *FONTS) if one and next(Path(one).rglob("*CJK*"), None) is not None]
+        data |= {"font": [FONT, *CJK]} if folders else {"remarks": [NO_FONT, *data["remarks"]]}
     template = files("abbe.service.rendering").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
-    made = typst.compile(template, format="pdf", ignore_system_fonts=True, sys_inputs=inputs)
+    made = typst.compile(template, format="pdf", font_paths=folders, ignore_system_fonts=True, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
 

@@ -9,9 +9,10 @@ import numpy as np
 import pypdf
 import pytest
 
+from abbe.service.rendering import document_page
 from abbe.service.rendering.document import DECISION_RULE, Document, Instrument, PictureBlock, ReportFigure, Section, TextTable
 from abbe.service.rendering.document_data import document_csv, document_json
-from abbe.service.rendering.document_page import document_html, document_pdf, standalone
+from abbe.service.rendering.document_page import NO_FONT, document_html, document_pdf, standalone
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
 from abbe.service.rendering.plots.polar import polar_plot
@@ -108,3 +109,13 @@ def test_limits_are_judged_with_the_guard_band(value, word, sign):
     assert [(f.limit, f.verdict) for f in rows] == [(10.0, word), (None, "")]
     assert verdict_of(found, [], ("open", "", ""))[0] == sign
     assert verdict_of(found, ["the air ...: the figures cannot be judged"], ("open", "", ""))[:2] == ("open", "Cannot tell")
+
+
+def test_east_asian_names_have_a_font_or_the_report_says_that_there_is_none(monkeypatch, tmp_path):
+    named = document(title="基準 공작기계")
+    monkeypatch.setattr(document_page, "FONTS", (str(tmp_path),))
+    monkeypatch.delenv("ABBE_FONTS", raising=False)
+    assert "".join(NO_FONT.split()) in pdf_text(document_pdf(named))
+    assert "".join(NO_FONT.split()) not in pdf_text(document_pdf(document()))
+    (tmp_path / "NotoSansCJK-Regular.otf").touch()
+    assert "".join(NO_FONT.split()) not in pdf_text(document_pdf(named)), "a font is there, and typst is given its folder"
