@@ -51,13 +51,14 @@ def document_pdf(document: Document) -> bytes:
     import typst
 
     data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
-    folders: list[str | Path | bytes] = []
+    folders: list[str] = []
     if _EAST.search(json.dumps(data, ensure_ascii=False)):
         folders += [one for one in (os.environ.get("ABBE_FONTS", ""), *FONTS) if one and next(Path(one).rglob("*CJK*"), None) is not None]
         data |= {"font": [FONT, *CJK]} if folders else {"remarks": [NO_FONT, *data["remarks"]]}
     template = files("abbe.service.rendering").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
-    made = typst.compile(template, format="pdf", font_paths=folders, ignore_system_fonts=True, sys_inputs=inputs)
+    fonts = typst.Fonts(include_system_fonts=False, font_paths=folders)
+    made = typst.compile(template, format="pdf", font_paths=fonts, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
 
