@@ -226,15 +226,41 @@ class BallBar(Protocol):
 
 
 class DisplacementMeter(Protocol):
-    """A laser Doppler displacement meter."""
+    """A laser Doppler displacement meter, or any other; positive: the target moves away from the instrument.
 
-    async def identify(self) -> DeviceInfo: ...
-    async def zero(self) -> None: ...
-    async def clear_beam(self) -> None: ...
-    async def set_environment_compensation(self, on: bool) -> None: ...
-    async def read(self, *, after_count: int | None = None) -> LaserReading: ...
-    async def peek(self) -> LaserReading: ...
-    async def close(self) -> None: ...
+    Every call ends in its own time-out. A driver makes a lost connection anew with the next call; its zero may be lost then.
+    """
+
+    async def identify(self) -> DeviceInfo:
+        """Return kind, model and serial number; the serial number tells two devices apart."""
+
+    async def zero(self) -> None:
+        """Make the present position 0. Raises DeviceFault where the device gives no valid reading."""
+
+    async def clear_beam(self) -> None:
+        """Clear the mark of a lost beam, if the device keeps one; a new zero is due then."""
+
+    async def set_environment_compensation(self, on: bool) -> None:
+        """Have the device correct its wavelength for the air, or not; a device without such a correction does nothing."""
+
+    async def read(self, *, after_count: int | None = None) -> LaserReading:
+        """Wait for a sample whose ``sample_count`` is not ``after_count``; ``host_s`` is `time.monotonic` of its arrival.
+
+        Raises
+        ------
+        DeviceFault
+            The sample is not valid, or the zero was lost.
+        ReplyTimeout
+            No new sample came.
+        LinkDown, BadFrame
+            Communication failed.
+        """
+
+    async def peek(self) -> LaserReading:
+        """Return the present sample, valid or not (`LaserFlag`), new or not."""
+
+    async def close(self) -> None:
+        """End the connection. Closing twice does nothing."""
 
 
 class Identity(Protocol):

@@ -18,8 +18,8 @@ from abbe.drivers.ballbar.driver import SerialBallBar
 from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.described.control import ListenedControl
 from abbe.drivers.described.opening import open_control, open_meter
-from abbe.drivers.described.tested import Ability
-from abbe.drivers.errors import BadUrl
+from abbe.drivers.described.tested import Ability, check_tested
+from abbe.drivers.errors import BadUrl, NotProved
 from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
 from abbe.drivers.laser.driver import ModbusLaser
 from abbe.drivers.links.modbus_link import Canary, ModbusLink
@@ -34,6 +34,7 @@ from abbe.drivers.links.urls import (
     described_by,
     installed,
     parse_url,
+    split_report,
 )
 from abbe.drivers.one_bank import OneBankTables
 
@@ -150,7 +151,8 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
         raise BadUrl(ascii(url), "open device", detail, remedy) from fault
     if not isinstance(driver, Mapping) or not callable(driver.get(role)):
         raise BadUrl(ascii(url), "open device", f"the driver {entry.value} opens no {role}", "is this the right device for this key?")
-    device = await driver[role](url)
+    bare, report = split_report(url)
+    device = await driver[role](bare)
     needed = {name for name in dir(ROLES[role]) if name[0] != "_"}
     if role == "cnc" and has_one_table(device):
         needed -= {name for name in (*dir(Tables), "comp_status") if name[0] != "_"}
@@ -159,6 +161,13 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
         if hasattr(device, "close"):
             await device.close()
         raise BadUrl(ascii(url), "open device", f"the driver {entry.value} lacks {', '.join(missing)}", remedy)
+    if report:
+        info = await _identify_or_close(device)
+        try:
+            check_tested(bare, report, "", info.serial_no, Ability.DWELL)
+        except NotProved:
+            await device.close()
+            raise
     return cast(object, device)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import math
 import statistics
+import time
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,6 +23,8 @@ SAMPLES = 10
 """Least number of readings at rest, and how long they are taken at least, s."""
 AVERAGED, SETTLED_S = 3, 0.3
 WATCHED_S = 1.0
+BUFFERED_S = 5.0
+"""A reading may have arrived so long before it was asked for, s."""
 CLOCK_FACTOR = 2.0
 """The device's clock may differ from this computer's by this factor in a test of a second; a wrong unit differs by 1000."""
 FACTORS = (
@@ -71,19 +74,32 @@ async def rate(probe: DeviceUnderTest, file: DeviceFile | None) -> list[DeviceCh
     try:
         await probe.zero()
         while len(taken) < SAMPLES or taken[-1].host_s - taken[0].host_s < WATCHED_S:
-            taken.append(await probe.sample(taken[-1].number if taken else None))
+            asked_s = time.monotonic()
+            sample = await probe.sample(taken[-1].number if taken else None)
+            if wrong := _wrong_by_driver(sample, taken, asked_s) if file is None else None:
+                return [wrong]
+            taken.append(sample)
     except DriverError as error:
         return [DeviceCheck("readings", FAILED, f"after {len(taken)} readings: {error}")]
     apart = [b.host_s - a.host_s for a, b in pairwise(taken)]
     mean_s = max(statistics.fmean(apart), 1e-9)
     jitter = f"{statistics.pstdev(apart) * 1e3:.1f} ms standard deviation, {max(apart) * 1e3:.0f} ms longest"
     found = [DeviceCheck("rate", PASSED, f"{1.0 / mean_s:.1f} readings a second; interval {mean_s * 1e3:.1f} ms, {jitter}")]
-    return [*found, _fresh(file), *_clock(taken), *_noise(taken, file)]
+    return [*found, _fresh(file), *_clock(taken, file), *_noise(taken, file)]
+
+
+def _wrong_by_driver(sample: Sample, taken: list[Sample], asked_s: float) -> DeviceCheck | None:
+    """What only a driver can do wrong: it gives a sample twice, or a time that is not this computer's."""
+    if taken and sample.number == taken[-1].number:
+        return DeviceCheck("freshness", FAILED, f"read(after_count={sample.number}) returned sample {sample.number} again")
+    if not asked_s - BUFFERED_S <= sample.host_s <= time.monotonic():
+        return DeviceCheck("clock", FAILED, f"host_s is {sample.host_s:.3f}, the reading came at {asked_s:.3f}: is it time.monotonic()?")
+    return None
 
 
 def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if file is None:
-        return DeviceCheck("freshness", PASSED, "by its driver")
+        return DeviceCheck("freshness", PASSED, "no sample came twice; that its numbers are the device's is up to its driver")
     stamp = next((name for name in ("counter", "time") if name in file.values), None)
     if stamp is not None:
         return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")
@@ -96,14 +112,15 @@ def _fresh(file: DeviceFile | None) -> DeviceCheck:
     return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: old values look like new ones")
 
 
-def _clock(taken: list[Sample]) -> list[DeviceCheck]:
+def _clock(taken: list[Sample], file: DeviceFile | None) -> list[DeviceCheck]:
     host_s, device_s = taken[-1].host_s - taken[0].host_s, taken[-1].device_s - taken[0].device_s
     if math.isnan(device_s):
         return []
     ratio = device_s / host_s
     good = 1.0 / CLOCK_FACTOR < ratio < CLOCK_FACTOR
     text = f"its time stamps advance {device_s:.2f} s in {host_s:.2f} s"
-    return [DeviceCheck("clock", PASSED if good else FAILED, text if good else f"{text}: is the unit of values.time right?")]
+    doubt = "is device_us in us" if file is None else "is the unit of values.time right"
+    return [DeviceCheck("clock", PASSED if good else FAILED, text if good else f"{text}: {doubt}?")]
 
 
 def _noise(taken: list[Sample], file: DeviceFile | None) -> list[DeviceCheck]:
@@ -140,7 +157,7 @@ async def _moved(probe: DeviceUnderTest, file: DeviceFile | None, name: str, mov
     await ask(done.get(name, f"Move axis {name.upper()} by +{about}."))
     after, after_words = await _mean(probe, name), await _words(probe, name)
     got = after - before
-    wrong = wrong_motion(got, move)
+    wrong = wrong_motion(got, move, "driver" if file is None else "device file")
     if wrong:
         order = _other_order(file, name, (before_words, after_words), move)
         return DeviceCheck(what, FAILED, order or wrong)
@@ -169,20 +186,20 @@ async def _words(probe: DeviceUnderTest, name: str) -> tuple[int, ...]:
     return (await probe.raw()).get(name, ())
 
 
-def wrong_motion(got_mm: float, move: Move) -> str:
-    """Name what is wrong with a motion as it was read; empty if nothing is."""
+def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
+    """Name what is wrong with a motion as it was read, and ``where`` to mend it; empty if nothing is wrong."""
     if abs(got_mm - move.mm) <= move.tolerance_mm:
         return ""
     read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"
     if abs(got_mm) <= move.tolerance_mm:
         return f"stuck: {read}: it does not follow the target"
     ratio = got_mm / move.mm
-    sign = "sign: it grows the wrong way, turn sign in the device file" if ratio < 0 else ""
+    sign = f"sign: it grows the wrong way, turn sign in the {where}" if ratio < 0 else ""
     if abs(abs(got_mm) - abs(move.mm)) <= move.tolerance_mm:
         return f"{sign} ({read})"
     share = move.tolerance_mm / abs(move.mm)
     known = next((f" ({why})" for factor, why in FACTORS if abs(abs(ratio) / factor - 1.0) <= share), "")
-    scale = f"scale: {read}, {abs(ratio):.4g} times{known}; divide scale in the device file by {abs(ratio):.6g}"
+    scale = f"scale: {read}, {abs(ratio):.4g} times{known}; divide scale in the {where} by {abs(ratio):.6g}"
     return "; ".join(filter(None, (sign, scale)))
 
 
@@ -202,7 +219,7 @@ def _other_order(file: DeviceFile | None, name: str, words: tuple[tuple[int, ...
 def _bad(file: DeviceFile | None) -> list[str]:
     """Test that an invalid reading is recognised."""
     if file is None:
-        return ["an error of its driver"]
+        return ["an error"]
     found: list[str] = sorted({flag.means for flag in file.flags} & INVALID)
     found += ["an error line"] if file.line is not None and file.line.error else []
     return [*found, "a reading out of range_mm"] if file.limits.range_mm is not None else found
@@ -224,4 +241,5 @@ async def quality(probe: DeviceUnderTest, file: DeviceFile | None, ask: Ask) -> 
         await ask("Free it again.")
     except DriverError as error:
         return DeviceCheck("quality", FAILED, f"after the beam was free again: {error}")
-    return DeviceCheck("quality", FAILED, f"a blocked or lifted sensor still reads as valid; the device file expects {', '.join(bad)}")
+    where = "driver" if file is None else "device file"
+    return DeviceCheck("quality", FAILED, f"a blocked or lifted sensor still reads as valid; the {where} expects {', '.join(bad)}")

@@ -9,12 +9,23 @@ from __future__ import annotations
 import asyncio
 import statistics
 from collections.abc import Awaitable, Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from urllib.parse import urlsplit
 
 from abbe.drivers.api import DeviceInfo
 from abbe.drivers.conformance.checks import Ask, Move, identity, motion, quality, rate
-from abbe.drivers.conformance.probe import BarProbe, ControlProbe, DeviceUnderTest, MeterProbe, Sample, SourceProbe
+from abbe.drivers.conformance.probe import (
+    BarProbe,
+    ControlProbe,
+    DeviceUnderTest,
+    DriverDefect,
+    MeterProbe,
+    Sample,
+    SourceProbe,
+    WatchedProbe,
+    watched,
+)
 from abbe.drivers.conformance.proxy import Fault, Proxy
 from abbe.drivers.described.control import ListenedControl
 from abbe.drivers.described.meter import DescribedMeter
@@ -22,7 +33,17 @@ from abbe.drivers.described.opening import Described, described, open_source
 from abbe.drivers.described.tested import Ability, CheckVerdict, DeviceCheck, TestReport
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import BadUrl, DriverError
-from abbe.drivers.links.urls import DeviceUrl, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, SocketUrl, described_by, installed, parse_url
+from abbe.drivers.links.urls import (
+    DeviceUrl,
+    FixtureConsoleUrl,
+    FixtureTcpUrl,
+    ModbusRtuUrl,
+    SocketUrl,
+    described_by,
+    installed,
+    parse_url,
+    split_report,
+)
 from abbe.drivers.registry import open_ballbar, open_controller, open_laser
 
 TRIES = 6
@@ -59,7 +80,7 @@ async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy
     """
     try:
         probe = await open_at()
-    except DriverError as error:
+    except (DriverError, DriverDefect) as error:
         return [DeviceCheck("replies", CheckVerdict.FAILED, f"the device cannot be opened behind a proxy: {error}")]
     try:
         await probe.zero()
@@ -70,10 +91,10 @@ async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy
             if proxy.cuts
             else [*found, DeviceCheck(Fault.CUT.value, CheckVerdict.NOT_PROVED, "a serial line has no connection to cut: pull its plug")]
         )
-    except DriverError as error:
+    except (DriverError, DriverDefect) as error:
         return [DeviceCheck("replies", CheckVerdict.FAILED, str(error))]
     finally:
-        await probe.close()
+        await _closed(probe)
 
 
 async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Rest) -> DeviceCheck:
@@ -86,6 +107,8 @@ async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Res
             return DeviceCheck(name, CheckVerdict.FAILED, f"no right reading within {RECOVERS_S:g} s; the last error: {refused or 'none'}")
         try:
             sample = await probe.sample(number)
+        except DriverDefect as defect:
+            return DeviceCheck(name, CheckVerdict.FAILED, str(defect))
         except DriverError as error:
             refused, good = f"{type(error).__name__}: {error.detail}", 0
             await asyncio.sleep(PAUSE_S)
@@ -98,6 +121,12 @@ async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Res
     return DeviceCheck(
         name, CheckVerdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right"
     )
+
+
+async def _closed(probe: DeviceUnderTest) -> None:
+    """Close a device; what its driver does wrong then was found before, or spoils no reading."""
+    with suppress(DriverDefect):
+        await probe.close()
 
 
 async def _rest(probe: DeviceUnderTest, least: float) -> _Rest:
@@ -153,13 +182,16 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
     WrongDevice, LinkDown, ReplyTimeout, BadFrame, DeviceFault
         Another device answers, or none: there is nothing to test.
     """
+    text, _ = split_report(text)
     about = None if installed(text) is not None or not described_by(parse_url(text)) else described(parse_url(text))
     file = None if about is None else about.file
     open_direct = _opener(text, about, options.role)
-    probe = await open_direct()
+    info, found = DeviceInfo(options.role, "", "", 0, ""), list[DeviceCheck]()
+    probe: DeviceUnderTest | None = None
     try:
+        probe = await open_direct()
         info = await probe.identify()
-        found = [*await identity(probe, file), *await rate(probe, file)]
+        found += [*await identity(probe, file), *await rate(probe, file)]
         if any(one.verdict is CheckVerdict.FAILED for one in found):
             return _report(text, about, options.role, info, found, utc)
         if options.ask is not None and options.move is not None:
@@ -167,8 +199,11 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
             found += [await quality(probe, file, options.ask)] if "displacement" in probe.moved else []
         else:
             found += [DeviceCheck(f"motion {name}", CheckVerdict.NOT_PROVED, "no known motion was made (--move)") for name in probe.moved]
+    except DriverDefect as defect:
+        return _report(text, about, options.role, info, [*found, DeviceCheck("driver", CheckVerdict.FAILED, str(defect))], utc)
     finally:
-        await probe.close()
+        if probe is not None:
+            await _closed(probe)
     if about is not None and not isinstance(about.url, ModbusRtuUrl):
         found.append(DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry none: a corrupted digit cannot be detected"))
     if options.faults:
@@ -179,7 +214,7 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
 def _report(text: str, about: Described | None, role: str, info: DeviceInfo, found: list[DeviceCheck], utc: str) -> TestReport:
     kind = role if about is None else about.file.kind
     return TestReport(
-        text.partition("&tested=")[0], kind, info.model, info.serial_no, "" if about is None else about.sha256, utc,
+        text, kind, info.model, info.serial_no, "" if about is None else about.sha256, utc,
         abilities(kind, tuple(found)), tuple(found),
     )  # fmt: skip
 
@@ -213,11 +248,11 @@ def _opener(text: str, about: Described | None, role: str) -> Callable[[], Await
 
     async def by_driver() -> DeviceUnderTest:
         if role == "laser":
-            return MeterProbe(await open_laser(text))
+            return WatchedProbe(MeterProbe(await watched("open", open_laser(text))))
         if role == "cnc":
-            return ControlProbe(await open_controller(text))
+            return WatchedProbe(ControlProbe(await watched("open", open_controller(text))))
         if role == "ballbar":
-            return BarProbe(await open_ballbar(text))
+            return WatchedProbe(BarProbe(await watched("open", open_ballbar(text))))
         raise BadUrl(ascii(text), "test device", f"there is no test for the role {role!r}", "use laser, ballbar or cnc")
 
     return by_driver

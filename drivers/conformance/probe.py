@@ -2,17 +2,19 @@
 
 from __future__ import annotations
 
+import asyncio
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator, Awaitable, Mapping
 from contextlib import AsyncExitStack, suppress
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from abbe.drivers.api import BallBar, BarBatch, Controller, DeviceInfo, DisplacementMeter, bar_is_valid, bar_reasons
 from abbe.drivers.described.source import DeviceSource, physical
 from abbe.drivers.device_file import DeviceFile
 from abbe.drivers.errors import DeviceFault, DriverError
 
+T = TypeVar("T")
 MM_PER_COUNT = 1e-7
 BAR_RATE_HZ = 100
 
@@ -38,6 +40,57 @@ class DeviceUnderTest(Protocol):
     async def sample(self, after: int | None) -> Sample: ...
     async def raw(self) -> Mapping[str, tuple[int, ...]]: ...
     async def close(self) -> None: ...
+
+
+CALL_S = 10.0
+"""Longest time that any call of a driver may take."""
+
+
+class DriverDefect(Exception):  # noqa: N818 - what it says is not an error of the device
+    """A driver does what no driver may: it never ends a call, or raises something else than an error of `abbe.drivers.errors`."""
+
+
+async def watched(operation: str, call: Awaitable[T]) -> T:
+    """Await a call of a driver.
+
+    Raises
+    ------
+    DriverDefect
+        It had not ended after `CALL_S`, or raised what is no error of `abbe.drivers.errors`.
+    """
+    try:
+        async with asyncio.timeout(CALL_S):
+            return await call
+    except DriverError:
+        raise
+    except TimeoutError:
+        raise DriverDefect(f"{operation} had not ended after {CALL_S:g} s: the driver needs a time-out") from None
+    except Exception as error:
+        what = f"{type(error).__name__}: {error}"
+        raise DriverDefect(f"{operation} raised {what}; only errors of abbe.drivers.errors are allowed") from error
+
+
+class WatchedProbe:
+    """Another probe, each call of which is `watched`."""
+
+    def __init__(self, probe: DeviceUnderTest) -> None:
+        self._probe = probe
+        self.name, self.moved = probe.name, probe.moved
+
+    async def identify(self) -> DeviceInfo:
+        return await watched("identify", self._probe.identify())
+
+    async def zero(self) -> None:
+        await watched("zero", self._probe.zero())
+
+    async def sample(self, after: int | None) -> Sample:
+        return await watched("read", self._probe.sample(after))
+
+    async def raw(self) -> Mapping[str, tuple[int, ...]]:
+        return await watched("read", self._probe.raw())
+
+    async def close(self) -> None:
+        await watched("close", self._probe.close())
 
 
 class MeterProbe:

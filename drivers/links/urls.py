@@ -17,6 +17,7 @@ Installed packages add devices with other protocols and other schemes: `installe
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from importlib.metadata import EntryPoint, entry_points
@@ -192,10 +193,23 @@ def described_by(url: DeviceUrl) -> Description:
     return NOT_DESCRIBED if isinstance(url, FixtureTcpUrl | FixtureConsoleUrl) else url.description
 
 
+_REPORT = re.compile(r"(?P<before>[?&])tested=(?P<path>[^&#]*)(?P<after>&?)")
+
+
+def split_report(text: str) -> tuple[str, str]:
+    """Return a URL without the report of its device's test, and the path of that report; empty: it names none."""
+    found = _REPORT.search(text)
+    if found is None:
+        return text, ""
+    between = found["before"] if found["after"] else ""
+    return text[: found.start()] + between + text[found.end() :], unquote(found["path"])
+
+
 def beside(text: str, folder: Path) -> str:
     """Return a URL whose files (`Description`) are found from any working directory; relative ones lie in ``folder``."""
     if installed(text) is not None:
-        return text
+        bare, report = split_report(text)
+        return f"{bare}{'&' if '?' in bare else '?'}tested={quote(str(folder / report))}" if report else text
     url = parse_url(text)
     found = described_by(url)
     if not found or isinstance(url, FixtureTcpUrl | FixtureConsoleUrl):

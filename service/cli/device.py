@@ -91,5 +91,9 @@ def try_device(
     lines += [f"{one.verdict:10} {one.check}: {one.text}" for one in report.findings]
     lines += [summary(report), *([] if out is None else [f"report: {out}"])]
     answer(report.to_document(), *lines, as_json=as_json)
-    conclude(f"abbe device test {quote(url)}" if report.failed else "abbe doctor", as_json=as_json)
+    again = [f"--role {role}"] if role != "laser" else []
+    again += [f"--move {move:g} --tolerance {tolerance:g}"] if move else []
+    again += [] if faults else ["--no-faults"]
+    again += [] if out is None else [f"--out {quote(str(out))}"]
+    conclude(" ".join(["abbe device test", quote(url), *again]) if report.failed else "abbe doctor", as_json=as_json)
     raise typer.Exit(1 if report.failed else 0)

@@ -148,7 +148,7 @@ async def _devices(site: Site) -> AsyncIterator[Examined]:
     for role, opened in opens.items():
         url = getattr(site.urls, role)
         if url is None and role == "cnc":
-            yield Examined(role, "bad", "not in the machine file: nothing can be measured", "add cnc = ... under [devices]")
+            yield Examined(role, "look", "not in the machine file: only `abbe listen` can measure", "add cnc = ... under [devices]")
             continue
         if url is None:
             yield Examined(role, "look", "not in the machine file", f"add {role} = ... under [devices], if there is one")

@@ -4,17 +4,22 @@ from __future__ import annotations
 
 import asyncio
 import importlib
+import json
 import struct
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from zlib import crc32
 
 import pytest
 
+from abbe.drivers.api import LaserReading
+from abbe.drivers.conformance import probe
 from abbe.drivers.conformance.checks import Move
 from abbe.drivers.conformance.device_test import Options, device_test
 from abbe.drivers.described.tested import Ability
-from abbe.drivers.errors import BadUrl
+from abbe.drivers.errors import BadUrl, NotProved
+from abbe.drivers.links.urls import beside
 from abbe.drivers.registry import open_controller, open_laser
 from tests.drivers.acme import meter as driver
 
@@ -68,6 +73,68 @@ async def test_it_passes_the_test_of_devices(device: tuple[Device, str]) -> None
     report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
     assert [one.check for one in report.failed] == ["motion displacement"]
     assert report.failed[0].text.startswith("sign: it grows the wrong way")
+
+
+Read = Callable[..., Awaitable[LaserReading]]
+
+
+async def _again(read: Read, meter: driver.AcmeMeter, after_count: int | None = None) -> LaserReading:
+    """A meter that is read faster than it measures."""
+    reading = await read(meter)
+    return replace(reading, sample_count=reading.sample_count // 4)
+
+
+async def _by_the_wall(read: Read, meter: driver.AcmeMeter, after_count: int | None = None) -> LaserReading:
+    reading = await read(meter, after_count=after_count)
+    return replace(reading, host_s=reading.host_s + 1.7e9)
+
+
+async def _careless(read: Read, meter: driver.AcmeMeter, after_count: int | None = None) -> LaserReading:
+    raise ValueError("invalid literal for int()")
+
+
+async def _patient(read: Read, meter: driver.AcmeMeter, after_count: int | None = None) -> LaserReading:
+    await asyncio.Event().wait()
+    raise AssertionError
+
+
+@pytest.mark.parametrize(
+    ("wrong", "check", "words"),
+    [
+        (_again, "freshness", "again"),
+        (_by_the_wall, "clock", "is it time.monotonic"),
+        (_careless, "driver", "read raised ValueError: invalid literal for int(); only errors of abbe.drivers.errors are allowed"),
+        (_patient, "driver", "read had not ended after 0.3 s: the driver needs a time-out"),
+    ],
+    ids=["old samples", "another clock", "raw errors", "no time-out"],
+)
+async def test_what_a_driver_does_wrong_is_named(
+    device: tuple[Device, str], monkeypatch: pytest.MonkeyPatch, wrong: Callable[..., Awaitable[LaserReading]], check: str, words: str
+) -> None:
+    right = driver.AcmeMeter.read
+
+    async def read(meter: driver.AcmeMeter, *, after_count: int | None = None) -> LaserReading:
+        return await wrong(right, meter, after_count)
+
+    monkeypatch.setattr(driver.AcmeMeter, "read", read)
+    if wrong is _patient:
+        monkeypatch.setattr(probe, "CALL_S", 0.3)
+    report = await device_test(device[1], Options(faults=False), "2026-11-26T00:00:00+00:00")
+    assert [one.check for one in report.failed] == [check]
+    assert words in report.failed[0].text
+    assert report.abilities == ()
+
+
+async def test_a_report_in_the_url_is_honoured(device: tuple[Device, str], tmp_path: Path) -> None:
+    acme, url = device
+    report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
+    (tmp_path / "right.json").write_text(json.dumps(report.to_document()))
+    acme.sign = -1.0
+    report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
+    (tmp_path / "wrong.json").write_text(json.dumps(report.to_document()))
+    await (await open_laser(beside(f"{url}?tested=right.json", tmp_path))).close()
+    with pytest.raises(NotProved, match="motion displacement: sign"):
+        await open_laser(beside(f"{url}?tested=wrong.json", tmp_path))
 
 
 async def test_a_driver_that_is_not_whole_is_refused_by_name(device: tuple[Device, str], monkeypatch: pytest.MonkeyPatch) -> None:
