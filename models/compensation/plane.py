@@ -1,12 +1,12 @@
-"""One-axis tables from a deviation that is known in a part of one plane only: there the two axes of the plane correct each other.
+"""One-axis tables from a deviation that is known in a part of the strokes only: in planes at one or several heights, or in a box.
 
-Beyond the known part the tables hold their end values: there, and at every other position of the third axis, they are assumed. The third
-axis is neither moved nor corrected.
+The axes that span it correct each other in the directions that were sensed. Beyond the known part the tables hold their end values: there,
+and at other positions of an axis that no plane spans, they are assumed. A direction that was not sensed is not corrected.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -16,51 +16,58 @@ from abbe.models.machine import Machine
 
 Known = Callable[[F2], tuple[F2, F2]]
 """Deviation and standard uncertainty at positions, mm, shape (n, 3) each; NaN in a direction that is not known."""
-NODES = 13
+NODES = {2: 13, 3: 7}
 
 
-def plane_tables(machine: Machine, box_mm: F2, known: Known, counts: tuple[int, int, int]) -> tuple[NineTables, Predicted]:
-    """Return the best tables of the plane, and the rms in it before and after them.
+def partial_tables(machine: Machine, boxes_mm: Sequence[F2], known: Known, counts: tuple[int, int, int]) -> tuple[NineTables, Predicted]:
+    """Return the tables that are best over all boxes together, and the rms in them before and after the tables.
 
     Parameters
     ----------
-    box_mm : array, shape (3, 2)
-        Part of the strokes in which the deviation is known; the third axis has an extent of zero.
+    boxes_mm : sequence of arrays, shape (3, 2)
+        Parts of the strokes in which the deviation is known, each but for a rigid motion of its own. Planes have an extent of zero along
+        their third axis; all boxes are spanned by the same axes.
     known : function
         `Known`; rigid motion removed over the points that it is asked for.
     counts : (int, int, int)
         Grid points of X, Y, Z.
     """
     grids = grid_positions(machine, counts)
-    moving = [a for a in range(3) if box_mm[a, 1] > box_mm[a, 0]]
-    nodes = [np.linspace(box_mm[a, 0], box_mm[a, 1], NODES) if a in moving else box_mm[a, :1] for a in range(3)]
-    points = np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
-    value, u = (np.nan_to_num(v) for v in known(points))
+    moving = [a for a in range(3) if boxes_mm[0][a, 1] > boxes_mm[0][a, 0]]
+    points = [_nodes(box, moving) for box in boxes_mm]
+    found = [known(p) for p in points]
+    sensed = [i for i in range(3) if not np.isnan(found[0][0][:, i]).any()]
+    value, u = (np.nan_to_num(np.concatenate(parts)) for parts in zip(*found, strict=True))
+    places = np.concatenate(points)
     correction, spread = [np.zeros((g.size, 3)) for g in grids], [np.zeros((g.size, 3)) for g in grids]
     for a in moving:
-        at = np.unique(points[:, a])
-        for i in moving:
-            mean = np.array([value[points[:, a] == x, i].mean() for x in at])
-            doubt = np.array([np.sqrt(np.mean(u[points[:, a] == x, i] ** 2)) for x in at])
-            correction[a][:, i] = _from_first(np.interp(grids[a], at, -mean))
-            spread[a][:, i] = np.interp(grids[a], at, doubt)
+        at = np.unique(places[:, a])
+        rows = [np.flatnonzero(places[:, a] == x) for x in at]
+        for i in sensed:
+            correction[a][:, i] = _from_first(np.interp(grids[a], at, [-value[r, i].mean() for r in rows]))
+            spread[a][:, i] = np.interp(grids[a], at, [np.sqrt(np.mean(u[r, i] ** 2)) for r in rows])
     tables = NineTables(grids, (correction[0], correction[1], correction[2]), (spread[0], spread[1], spread[2]))
-    left = value + tables.correction_at(points)
-    return tables, Predicted(_size(value[:, moving]), _size(_in_plane(points[:, moving], left[:, moving])), _size(u[:, moving]))
+    parts = np.split(value + tables.correction_at(places), np.cumsum([len(p) for p in points])[:-1])
+    left = np.concatenate([_without_motion(p, v, sensed) for p, v in zip(points, parts, strict=True)])
+    return tables, Predicted(_size(value[:, sensed]), _size(left), _size(u[:, sensed]))
+
+
+def _nodes(box_mm: F2, moving: list[int]) -> F2:
+    nodes = [np.linspace(box_mm[a, 0], box_mm[a, 1], NODES[len(moving)]) if a in moving else box_mm[a, :1] for a in range(3)]
+    return np.stack(np.meshgrid(*nodes, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
 def _from_first(values: F1) -> F1:
     return np.asarray(values - values[0])
 
 
-def _in_plane(at: F2, values: F2) -> F2:
-    """Remove the best-fit rigid motion in the plane, shape (n, 2)."""
-    away = at - at.mean(axis=0)
-    rigid = np.zeros((*away.shape, 3))
-    rigid[:, 0, 0] = rigid[:, 1, 1] = 1.0
-    rigid[:, :, 2] = np.stack([-away[:, 1], away[:, 0]], axis=1)
-    rows, y = rigid.reshape(-1, 3), values.reshape(-1)
-    return np.asarray((y - rows @ np.linalg.lstsq(rows, y, rcond=None)[0]).reshape(values.shape))
+def _without_motion(at: F2, values: F2, sensed: list[int]) -> F2:
+    """Remove the best-fit rigid motion in the sensed directions, shape (n, sensed)."""
+    away, unit = at - at.mean(axis=0), np.eye(3)
+    turns = [k for k in range(3) if len(sensed) == 3 or k not in sensed]
+    columns = [np.tile(unit[k], (len(at), 1)) for k in sensed] + [np.cross(unit[k], away) for k in turns]
+    rows, y = np.stack(columns, axis=-1)[:, sensed].reshape(-1, len(columns)), values[:, sensed].reshape(-1)
+    return np.asarray((y - rows @ np.linalg.lstsq(rows, y, rcond=None)[0]).reshape(-1, len(sensed)))
 
 
 def _size(values: F2) -> float:

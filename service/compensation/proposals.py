@@ -21,7 +21,7 @@ import numpy as np
 from abbe.drivers.api import TableController, TableFormat
 from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.arrays import F2
-from abbe.models.compensation.plane import plane_tables
+from abbe.models.compensation.plane import partial_tables
 from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.scales import SCALE_TEXTS
@@ -32,7 +32,7 @@ from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts, touched_box_mm, unsensed_axis
+from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts, touched_boxes_mm, unsensed_axis
 from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
 from abbe.service.identification.solve_report import assess, solution_doc
@@ -262,7 +262,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
     Raises
     ------
     TableRefused
-        The readings do not support the map, the artefacts span a volume, or (``without_scale``) the scales are not the least certain.
+        The readings do not support the map, or (``without_scale``) the scales are not the least certain.
     """
     solved = solve_runs(site, runs)
     if not only_artefacts(solved.joint) and (beyond := beyond_the_prior(solved.joint)):
@@ -274,7 +274,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
 def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTables, Predicted, tuple[str, ...]]:
     """Return what a solution adds to the tables in force, the prediction, and what is left out, in words; as for `propose`."""
     if only_artefacts(solved.joint):
-        return _change_in_plane(solved)
+        return _change_where_touched(solved)
     if not without_scale:
         change = nine_tables(solved.joint, GRID)
         return change, predict_residual(solved.joint, change), ()
@@ -284,20 +284,18 @@ def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTable
     return change, predict_residual(sources.solution, change, sources=sources), (f"{text}, poorly determined by the runs: left out",)
 
 
-def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, ...]]:
-    """Return tables of the plane in which artefacts lay; beyond the touched positions they hold their end values.
+def _change_where_touched(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, ...]]:
+    """Return tables of the planes or of the volume in which artefacts lay; beyond the touched positions they hold their end values.
 
     Raises
     ------
     TableRefused
-        The solution corrected a fault of the set-up without review, or all three directions were sensed.
+        The solution corrected a fault of the set-up without review.
     """
     joint = solved.joint
     if solved.undone:
         fault = solved.undone[0]
         raise TableRefused(f"run {fault.run}: {fault.what} ({fault.done})", "look at the artefact and measure that pose again")
-    if unsensed_axis(joint) is None:
-        raise TableRefused("these artefacts span a volume: one-axis tables need artefacts in one plane", "make a grid: abbe solve --tables")
     frame: list[str] = []
 
     def known(points: F2) -> tuple[F2, F2]:
@@ -305,8 +303,11 @@ def _change_in_plane(solved: Solved) -> tuple[NineTables, Predicted, tuple[str, 
         frame.append(words)
         return value, 0.5 * expanded
 
-    change, predicted = plane_tables(joint.machine, touched_box_mm(joint), known, GRID)
-    return change, predicted, (f"known in the plane and part of the strokes where the artefact lay only, assumed elsewhere; {frame[0]}",)
+    boxes = touched_boxes_mm(joint)
+    change, predicted = partial_tables(joint.machine, boxes, known, GRID)
+    where = "part of the strokes where the artefact lay only, assumed elsewhere"
+    planes = f"plane{'s' if len(boxes) > 1 else ''} and " if unsensed_axis(joint) is not None else ""
+    return change, predicted, (f"known in the {planes}{where}; {frame[0]}",)
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:

@@ -24,9 +24,10 @@ from abbe.service.demo.simulator_process import running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.domain.progress import Progress, ProgressSink
-from abbe.service.identification.artefact_answer import artefact_lines, touched_box_mm
+from abbe.service.identification.artefact_answer import artefact_lines, touched_boxes_mm
 from abbe.service.rendering.document import Document, Lines, Section, TextTable
 from abbe.service.rendering.numbers import plain
+from abbe.service.report.artefact_sections import artefact_sections
 from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
@@ -75,7 +76,7 @@ async def run_artefact_demo(seed: int, speed: float, folder: Path, progress: Pro
         finally:
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "reading the simulator's sealed truth"))
-    box = touched_box_mm(result.corrected.solved.joint)
+    (box,) = touched_boxes_mm(result.corrected.solved.joint)
     plane = ["--plane", *(f"{v:.3f}" for v in (*box[0], *box[1], box[2, 0]))]
     result.truth_before = await sealed_truth([*args, *plane], None)
     result.truth_after = await sealed_truth([*args, *plane], folder / "active_bank.bin")
@@ -141,6 +142,6 @@ def artefact_report(result: DemoResult) -> Document:
     rows.append(("sealed truth, rms in the plane", before, "", after, ""))
     table = TextTable(("figure, µm", "before", "U (95 %)", "after", "U (95 %)"), tuple(rows))
     told = Section("Results of these poses", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
-    sections = (Section("Before and after", [c.decision.text, table]), told)
+    sections = (Section("Before and after", [c.decision.text, table]), *artefact_sections(c.solved.joint), told)
     title = f"Simulated machine {result.seed}, measured by its own probe"
     return Document(kind="cycle", title=title, sections=sections, signatures=())

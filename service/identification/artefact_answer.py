@@ -18,6 +18,8 @@ from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 SENSED = 1e-3
 """An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
 COVERAGE = 2.0
+ONE_PLANE_MM = 5.0
+"""Points lie in one plane if their heights follow each other by no more."""
 WHOLE_TO, NOTHING_FROM = 0.35, 1.0
 """Mean squared uncertainty over mean squared deviation up to which a map is offered whole, and from which not at all."""
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
@@ -75,13 +77,16 @@ def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2,
     return deviation, expanded, MOTION.format(plane=plane[0], scale=scale[0]) + scale[1] + plane[1]
 
 
-def touched_box_mm(joint: JointSolution) -> F2:
-    """Return the lowest and highest position of each axis over all points, mm, shape (3, 2); an axis whose direction is unsensed stands."""
+def touched_boxes_mm(joint: JointSolution) -> tuple[F2, ...]:
+    """Return the lowest and highest position of each axis over all points, mm, shape (3, 2): one box, or, where the direction of an axis
+    was not sensed, one for each of its positions, at which that axis stands."""
     places = np.concatenate([run.axes_mm for run in joint.data if run.points is not None and run.points.source != "length"])
     box, axis = np.stack([places.min(axis=0), places.max(axis=0)], axis=1), unsensed_axis(joint)
-    if axis is not None:
-        box[axis] = places[:, axis].mean()
-    return box
+    if axis is None:
+        return (box,)
+    heights = np.sort(places[:, axis])
+    planes = np.split(heights, np.flatnonzero(np.diff(heights) > ONE_PLANE_MM) + 1)
+    return tuple(np.where(np.arange(3)[:, None] == axis, plane.mean(), box) for plane in planes)
 
 
 def _offered(value_mm: F2, u_mm: F2) -> float:

@@ -36,6 +36,7 @@ from abbe.service.rendering.model import (
 from abbe.service.rendering.plots.bars import share_plot
 from abbe.service.rendering.plots.maps import cell_map, common_step, correlation_plot, gain_map
 from abbe.service.rendering.plots.tables import motion_bands
+from abbe.service.report.artefact_sections import artefact_sections
 from abbe.service.report.blocks import U_OF, RunRow, parameter_pictures, parameter_table, residual_picture, run_table, setup_section, stated
 
 CURVE_NODES = 61
@@ -52,6 +53,7 @@ def solution_sections(found: Assessment, solution: SolutionFile) -> list[Section
     """
     shares = [MotionShare(m.name, m.share, m.status) for m in found.observability.motions]
     return [
+        *artefact_sections(found.joint),
         Section("Parameters", _parameters(found)),
         Section("Error motions", _motions(found)),
         Section("Information of these runs about each error motion", _observability(found, shares)),

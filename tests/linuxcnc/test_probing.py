@@ -146,10 +146,13 @@ async def test_a_plate_maps_corrects_and_verifies_the_plane(instances, tmp_path)
             await bring(session.controller, store, site, quantise(change, 1e-4))  # type: ignore[arg-type]
             await measure(session, store, site, poses("after", CHECK, "holdout"))
         before, after = (pose_figures(from_store(store, name).runs, solved.joint).worst for name in ("before", "after"))
-        figures = f"rms um: before {1e3 * before.value_mm:.2f}, after {1e3 * after.value_mm:.2f}, promised {promised}"
+        rows = (("before", before), ("after", after))
+        said = [f"{name} {1e3 * f.value_mm:.2f} ± {2e3 * f.u_mm:.2f}" for name, f in rows]
+        figures = f"rms um: {', '.join(said)}, promised {1e3 * promised.after_mm:.2f} ± {2e3 * promised.u_model_mm:.2f}"
         sys.stderr.write(figures + "\n")
         assert before.value_mm > 0.003
         assert after.value_mm < 0.4 * before.value_mm, figures
+        assert after.value_mm - promised.after_mm < 2.0 * np.hypot(promised.u_model_mm, after.u_mm), figures
 
 
 @pytest.mark.timeout(300)

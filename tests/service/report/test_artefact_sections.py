@@ -1,0 +1,54 @@
+"""A solution of artefacts in a report and in tables: arrows where they lay, and the poses; heights by themselves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.compensation.proposals import change_of
+from abbe.service.identification.artefact_answer import touched_boxes_mm
+from abbe.service.identification.solve import Solved, solve_runs
+from abbe.service.rendering.document import PictureBlock, TextTable
+from abbe.service.report.artefact_sections import artefact_sections
+from tests.artefact_campaign import campaign, error_mm
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Solved:
+    """The third pose lies 100 mm higher; the errors are the same there."""
+    found = from_folder(campaign(Path(tmp_path_factory.mktemp("plate"))))
+    runs = list(found.runs)
+    columns = replace(runs[2].columns, q_mm=runs[2].columns.q_mm + np.array([0.0, 0.0, 100.0]))
+    runs[2] = replace(runs[2], columns=columns)
+    return solve_runs(found.site, runs)
+
+
+def test_each_height_has_its_picture_beside_the_poses(solved: Solved) -> None:
+    (section,) = artefact_sections(solved.joint)
+    pictures, poses = section.blocks
+    assert isinstance(pictures, PictureBlock)
+    assert isinstance(poses, TextTable)
+    assert [f"Z = {z} mm" in svg for z, svg in zip((200, 300), pictures.svgs, strict=True)] == [True, True]
+    assert "best-fit rigid motion in the plane" in pictures.caption
+    assert [row[0] for row in poses.rows] == ["p1", "p2", "p3", "p4"]
+    assert "x (0, 1, 0), y (-1, 0, 0)" in poses.rows[1][5]
+
+
+def test_tables_of_two_heights_take_out_what_both_have(solved: Solved) -> None:
+    assert [box[2].tolist() for box in touched_boxes_mm(solved.joint)] == [[200.0, 200.0], [300.0, 300.0]]
+    change, promised, (text,) = change_of(solved)
+    assert text.startswith("known in the planes and part of the strokes")
+    x, y = np.meshgrid(np.linspace(280.0, 520.0, 7), np.linspace(120.0, 360.0, 7))
+    at = np.column_stack([x.ravel(), y.ravel(), np.full(49, 250.0)])
+    left = error_mm(*at[:, :2].T) + change.correction_at(at)[:, :2]
+    away = at[:, :2] - at[:, :2].mean(axis=0)
+    basis = np.stack([np.tile([1.0, 0.0], (49, 1)), np.tile([0.0, 1.0], (49, 1)), np.stack([-away[:, 1], away[:, 0]], 1)], -1).reshape(
+        98, 3
+    )
+    left = left.ravel() - basis @ np.linalg.lstsq(basis, left.ravel(), rcond=None)[0]
+    assert np.sqrt(np.mean(left**2)) < 0.2 * promised.before_mm
+    assert not change.correction_mm[2].any()
