@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, MachineObject
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
@@ -55,10 +55,7 @@ class RulesSummary:
 class MachineSummary:
     """Nominal geometry of the machine and its largest feed: the input of a dry run."""
 
-    chain: Word
-    stroke_mm: dict[str, tuple[float, float]]
-    pivots_mm: dict[str, tuple[float, float, float]]
-    tool_mm: tuple[float, float, float]
+    machine: MachineObject
     max_feed_mm_min: float
 
 

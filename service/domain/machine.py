@@ -84,14 +84,19 @@ class MachineObject(FileObject):
     tool_mm: Point | None = None
 
 
-class RunFileHead(FileObject):
+class MeasuredFile(FileObject):
+    """What runs and campaigns state: whose readings they are."""
+
+    campaign: Name
+    machine: MachineObject
+
+
+class RunFileHead(MeasuredFile):
     """What every run states, of an instrument or of an artefact (``abbe-run/1``)."""
 
     format: Literal["abbe-run/1"]
-    campaign: Name
     run_id: Name
     role: Role
-    machine: MachineObject
 
 
 UNIT = "1"

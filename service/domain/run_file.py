@@ -8,7 +8,7 @@ from pydantic import ConfigDict, Field, model_validator
 
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
-from abbe.service.domain.machine import FileObject, Interval, MachineObject, Name, Point, Role, RunFileHead
+from abbe.service.domain.machine import FileObject, Interval, MeasuredFile, Name, Point, Role, RunFileHead
 
 RUN_FORMAT = "abbe-run/1"
 CAMPAIGN_FORMAT = "abbe-campaign/1"
@@ -120,12 +120,10 @@ class RunEntry(FileObject):
     file: FileName
 
 
-class CampaignFile(FileObject):
+class CampaignFile(MeasuredFile):
     """Head of a campaign folder (``abbe-campaign/1``)."""
 
     format: Literal["abbe-campaign/1"]
-    campaign: Name
-    machine: MachineObject
     current_model: CurrentModel
     instruments: dict[str, FileObject]
     setups: dict[str, CampaignSetup]

@@ -83,11 +83,13 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def _lattice(file: TextFile, found: dict[str, F1], rows: list[list[float]]) -> Lattice:
-    if set(found) != {"COUNT", "FIRST", "STEP"} or any(v.size != 3 for v in found.values()) or not (found["STEP"] > 0).all():
+    wanted = [found[name] for name in ("COUNT", "FIRST", "STEP") if name in found]
+    if len(wanted) != len(found) or len(wanted) != 3 or any(v.size != 3 for v in wanted) or not (wanted[2] > 0).all():
         raise file.wrong(1, "COUNT, FIRST and STEP of three axes are not there")
-    nx, ny, nz = (int(v) for v in found["COUNT"])
+    count, first, step = wanted
+    nx, ny, nz = (int(v) for v in count)
     if min(nx, ny, nz) < 2 or len(rows) != nx * ny * nz:
         raise file.wrong(len(file.text.splitlines()), f"{len(rows)} nodes, {nx} x {ny} x {nz} stated")
-    x, y, z = (f + s * np.arange(int(n)) for f, s, n in zip(found["FIRST"], found["STEP"], found["COUNT"], strict=True))
+    x, y, z = (f + s * np.arange(int(n)) for f, s, n in zip(first, step, count, strict=True))
     values = SIGN.from_file(np.array(rows), np.zeros(1)).reshape(nx, ny, nz, 3)
     return Lattice((x, y, z), values)

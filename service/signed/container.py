@@ -114,23 +114,33 @@ def _check_files(claims: Claims, files: Mapping[str, bytes]) -> None:
         raise SignatureRefused(f"{', '.join(wrong)}: differs from what was signed", FILE_REMEDY)
 
 
+@dataclass(frozen=True, slots=True)
+class _Sealed:
+    """The keys of a .sig file, of which none may be missing and no other may stand there."""
+
+    format: str
+    key: str
+    claims: dict[str, Any]
+    signature: str
+
+
 def _parts(sealed: bytes) -> tuple[str, Claims, bytes]:
     """Key, claims and signature. Only the canonical encoding is accepted, so no two files carry the same claims."""
     try:
         if len(sealed) > LARGEST:
             raise ValueError
         doc: dict[str, Any] = json.loads(sealed.decode("utf-8"))
-        if canonical(doc) + b"\n" != sealed or set(doc) != {"format", "key", "claims", "signature"} or doc["format"] != FORM:
+        found = _Sealed(**doc)
+        claims, signature = Claims(**found.claims), bytes.fromhex(found.signature)
+        if canonical(doc) + b"\n" != sealed or found.format != FORM:
             raise ValueError
-        claims = Claims(**doc["claims"])
-        texts = [v for k, v in asdict(claims).items() if k != "files"] + [doc["key"], *claims.files.values()]
-        signature = bytes.fromhex(doc["signature"])
-        if not all(isinstance(text, str) for text in texts) or signature.hex() != doc["signature"]:
+        texts = [v for k, v in asdict(claims).items() if k != "files"] + [found.key, *claims.files.values()]
+        if not all(isinstance(text, str) for text in texts) or signature.hex() != found.signature:
             raise ValueError
         _utc(claims.signed_utc), _utc(claims.expiry_utc)
     except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
         raise SignatureRefused(f"the .sig file is not of the form {FORM}, or was changed", FILE_REMEDY) from None
-    return doc["key"], claims, signature
+    return found.key, claims, signature
 
 
 def _utc(text: str) -> datetime:

@@ -57,18 +57,18 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
 
 def _stall_detection(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
     """Return a callback for the steps of SQLite's backup that ends a copy without progress, or after too many ``restarts`` (None: any)."""
-    last = {"left": -1, "restarts": 0}
-    moved_s = [time.monotonic()]
+    last_left, restarted, moved_s = -1, 0, time.monotonic()
 
     def after_step(_status: int, left: int, _total: int) -> None:
+        nonlocal last_left, restarted, moved_s
         now_s = time.monotonic()
-        if left == last["left"]:
-            if now_s - moved_s[0] > locked_s:
+        if left == last_left:
+            if now_s - moved_s > locked_s:
                 raise _LockedError
             return
-        last["restarts"] += left > last["left"] >= 0
-        last["left"], moved_s[0] = left, now_s
-        if restarts is not None and last["restarts"] > restarts:
+        restarted += left > last_left >= 0
+        last_left, moved_s = left, now_s
+        if restarts is not None and restarted > restarts:
             raise _RestartedTooOftenError
 
     return after_step

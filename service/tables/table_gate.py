@@ -16,7 +16,7 @@ import numpy as np
 
 from abbe.drivers.api import BankState, CompStatus, TableController
 from abbe.service.clock import SystemClock
-from abbe.service.domain.document import Doc
+from abbe.service.domain.document import Doc, parsed
 from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntry, PushState
 from abbe.service.errors import TableMismatch
 from abbe.service.push.journal import StoreBook
@@ -101,16 +101,17 @@ def known_tables(store: Store) -> KnownTables:
         key, doc = (mark.machine, mark.push), mark.doc
         named = (last[key].machine, last[key].control) if key in last else (doc.get("machine", mark.machine), doc.get("control", ""))
         last[key] = PushedTable(mark.machine, mark.push, mark.state, str(named[0]), str(named[1]))
-        crcs.update(int(doc[name]) for name in ("base_crc", "crc", "accepted_crc") if name in doc)
-        if mark.state == PushState.SNAPSHOT and "crc" in doc:
-            base = int(doc["base_crc"])
+        known = parsed(_Crcs, doc)
+        crcs.update(one for one in (known.base_crc, known.crc, known.accepted_crc) if one is not None)
+        if mark.state == PushState.SNAPSHOT and known.begun is not None:
+            base, written = known.begun
             if base in endorsed or base not in crc.values():
                 _add(endorsed, base, "found in force", last[key], mark)
-            crc[key] = int(doc["crc"])
+            crc[key] = written
         elif mark.state == PushState.KEEP and key in crc:
             _add(endorsed, crc[key], "verified", last[key], mark)
-        elif "accepted_crc" in doc:
-            _add(endorsed, int(doc["accepted_crc"]), "accepted", last[key], mark)
+        elif known.accepted_crc is not None:
+            _add(endorsed, known.accepted_crc, "accepted", last[key], mark)
     pushed = {number: last[key] for key, number in crc.items()}
     return KnownTables({number: last[key] for number, key in unverified.items()}, frozenset(crcs), pushed, endorsed)
 
@@ -129,22 +130,41 @@ def unverified_crcs(entries: Sequence[PushEntry]) -> dict[int, int]:
     return {crc: push for crc, push in found.items() if isinstance(push, int)}
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Crcs:
+    """The tables that an entry of the push journal names: found in force, written, accepted by a person."""
+
+    base_crc: int | None = None
+    crc: int | None = None
+    accepted_crc: int | None = None
+
+    @property
+    def begun(self) -> tuple[int, int] | None:
+        """The table found in force and the one to be written, of the first entry of a push; None if it names none."""
+        if self.crc is None:
+            return None
+        if self.base_crc is None:
+            raise KeyError("base_crc")
+        return self.base_crc, self.crc
+
+
 def _unverified(rows: Iterable[Row]) -> dict[int, Hashable]:
     """Unverified tables. A table found in force counts as endorsed, unless an earlier push wrote it and did not keep it."""
     candidates: dict[int, Hashable] = {}
     pushed: dict[Hashable, int] = {}
     endorsed: set[int] = set()
     for push, state, doc in rows:
-        if state == PushState.SNAPSHOT and "crc" in doc:
-            base, crc = int(doc["base_crc"]), int(doc["crc"])
+        known = parsed(_Crcs, doc)
+        if state == PushState.SNAPSHOT and known.begun is not None:
+            base, crc = known.begun
             if base not in candidates:
                 endorsed.add(base)
             pushed[push] = crc
             candidates.setdefault(crc, push)
         elif state == PushState.KEEP and push in pushed:
             endorsed.add(pushed[push])
-        elif state == PushState.ACCEPTED and "accepted_crc" in doc:
-            endorsed.add(int(doc["accepted_crc"]))
+        elif state == PushState.ACCEPTED and known.accepted_crc is not None:
+            endorsed.add(known.accepted_crc)
     return {crc: push for crc, push in candidates.items() if crc not in endorsed}
 
 

@@ -136,12 +136,9 @@ def _web(loaded: LoadedMachine, port: int | None) -> Web:
 
 def _summary(site: Site) -> MachineSummary:
     from abbe.service.channel.messages import MachineSummary
+    from abbe.service.domain.machine import MachineObject
 
-    doc = site.doc
-    axes = {axis: (float(low), float(high)) for axis, (low, high) in doc["stroke_mm"].items()}
-    pivots = {axis: (float(x), float(y), float(z)) for axis, (x, y, z) in doc["pivots_mm"].items()}
-    x, y, z = doc["tool_mm"]
-    return MachineSummary(doc["chain"], axes, pivots, (float(x), float(y), float(z)), site.max_feed_mm_min)
+    return MachineSummary(MachineObject.read(site.doc), site.max_feed_mm_min)
 
 
 def _broker(loaded: LoadedMachine) -> Broker | None:

@@ -90,9 +90,7 @@ class Rehearsals:
             return None
         startable = recipe in {split_recipe_name(name)[0] for name in self.recipes}
         try:
-            machine = machine_from_doc(
-                {"chain": given.chain, "stroke_mm": given.stroke_mm, "pivots_mm": given.pivots_mm, "tool_mm": given.tool_mm}
-            )
+            machine = machine_from_doc(given.machine.model_dump())
             plan = identification(machine, rate_hz=rate_hz) if recipe == CAMPAIGN else recipe_plan(named(recipe, rate_hz), machine)
             runs = dry_run_campaign(machine, plan, given.max_feed_mm_min)
         except AbbeError as error:

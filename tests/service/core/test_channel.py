@@ -22,7 +22,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, MachineObject
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreSilent
@@ -33,6 +33,7 @@ from tests.patience import within
 from tests.service.core.fakes import FakeClock, settle, utc
 
 NOW = utc(2026, 11, 22, 6)
+MACHINE = MachineObject.read({"chain": "w-Y-X-b-Z-t", "vertical_axis": "Z", "stroke_mm": dict.fromkeys("XYZ", (0.0, 600.0))})
 MOMENT = m.Snapshot(
     "snapshot",
     3,
@@ -79,7 +80,9 @@ CORE = [
         False,
         (),
         m.RulesSummary({}, None, None, {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)}),
-        m.MachineSummary("w-Y-X-b-Z-t", {"X": (0.0, 600.0)}, {"X": (0.0, 0.0, 0.0)}, (0.0, 0.0, 150.0), 6000.0),
+        m.MachineSummary(
+            MachineObject.read({"chain": "w-Y-X-b-Z-t", "vertical_axis": "Z", "stroke_mm": dict.fromkeys("XYZ", (0.0, 600.0))}), 6000.0
+        ),
         ("identification",),
         1024,
         "modbus+tcp://127.0.0.1:502",

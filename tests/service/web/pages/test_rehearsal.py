@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import httpx
@@ -10,6 +11,7 @@ from fastapi import FastAPI
 
 from abbe.service.channel.messages import MachineSummary, RulesSummary
 from abbe.service.clock import SystemClock
+from abbe.service.domain.machine import MachineObject
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.recipes.campaigns import RATES_HZ, named, recipe_plan, split_recipe_name
@@ -24,8 +26,9 @@ from abbe.service.web.strip import strip_of
 from tests.service.core.fakes import utc
 
 STROKES = {"X": (0.0, 600.0), "Y": (0.0, 500.0), "Z": (0.0, 450.0)}
-TOLD = MachineSummary("w-Y-X-b-Z-t", STROKES, dict.fromkeys("XYZ", (0.0, 0.0, 0.0)), (0.0, 0.0, 150.0), 6000.0)
-MACHINE = machine_from_doc({"chain": TOLD.chain, "stroke_mm": TOLD.stroke_mm, "pivots_mm": TOLD.pivots_mm, "tool_mm": TOLD.tool_mm})
+DOC = {"chain": "w-Y-X-b-Z-t", "vertical_axis": "Z", "stroke_mm": STROKES, "tool_mm": (0.0, 0.0, 150.0)}
+TOLD = MachineSummary(MachineObject.read(DOC), 6000.0)
+MACHINE = machine_from_doc(DOC)
 PLANS = Rehearsals(TOLD, ("quick-check", "verification"))
 
 
@@ -47,7 +50,7 @@ def test_it_says_what_the_command_line_says(rate_hz: int) -> None:
 
 
 def test_what_cannot_be_run_says_why() -> None:
-    slow = Rehearsals(MachineSummary(**{**_fields(), "max_feed_mm_min": 500.0}), ("quick-check",)).run("quick-check", 100)
+    slow = Rehearsals(replace(TOLD, max_feed_mm_min=500.0), ("quick-check",)).run("quick-check", 100)
     assert slow is not None
     assert not slow.startable
     assert "allowed are 500" in slow.trouble
@@ -110,7 +113,3 @@ def test_certificates_that_are_over_are_told() -> None:
     rules = RulesSummary({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
     assert expired_certificates(rules, today) == [("ballbar", today.replace(year=2025))]
     assert expired_certificates(None, today) == []
-
-
-def _fields() -> dict[str, object]:
-    return {name: getattr(TOLD, name) for name in ("chain", "stroke_mm", "pivots_mm", "tool_mm", "max_feed_mm_min")}
