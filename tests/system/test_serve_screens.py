@@ -386,6 +386,27 @@ def test_a_trend_is_zoomed_read_and_taken_along(chromium, running, axe) -> None:
         assert watch.foreign == []
 
 
+def test_the_readings_of_a_run_are_looked_into(chromium, running) -> None:
+    if not has_uplot():
+        pytest.skip("uPlot was not fetched (deploy/npm_files.py)")
+    with context(chromium) as made:
+        page = made.new_page()
+        watch = Watch(page, running.base)
+        log_in(page, running.base, "vera")
+        page.goto(f"{running.base}/run?id=1")
+        page.wait_for_function(MAP_READY)
+        page.wait_for_selector("[data-run] output:not(:empty)")
+        with page.expect_response("**/run/curve?*") as closer:
+            page.click("[data-run] [data-do=in]")
+        asked = closer.value.json()
+        assert asked["whole"][0] <= asked["x"][0] < asked["x"][-1] <= asked["whole"][1]
+        page.wait_for_selector("[data-run][data-shown]")
+        with page.expect_download() as table:
+            page.click("[data-run] [data-do=csv]")
+        assert len(Path(table.value.path()).read_text(encoding="utf-8").splitlines()) == 1 + len(asked["x"]) < asked["readings"]
+        assert watch.errors == []
+
+
 def pixels(page: Page) -> str:
     return str(page.evaluate("() => document.querySelector('[data-plot] canvas').toDataURL()"))
 

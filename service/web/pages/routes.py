@@ -7,12 +7,12 @@ import secrets
 from typing import Annotated
 
 from fastapi import FastAPI, Query, Request
-from fastapi.responses import HTMLResponse, RedirectResponse, Response
+from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
 from pydantic import AfterValidator
 
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import same_person
-from abbe.service.errors import NotStored, TableRefused, Unusable
+from abbe.service.errors import AbbeError, NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
 from abbe.service.queries.alarms import path_with
 from abbe.service.queries.results import discoveries
@@ -30,6 +30,7 @@ from abbe.service.web.pages.context import Number, PageContext, can_be_stored, f
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
+from abbe.service.web.pages.run_curve import NOTHING, run_curve
 from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, run_list, run_screen
 from abbe.service.web.problems import problem
 
@@ -64,6 +65,7 @@ def add_pages(app: FastAPI, context: PageContext) -> None:
         return Response(PLOT_STYLE, media_type="text/css")
 
     _add_runs(app, context)
+    _add_run_curve(app, context)
     _add_results(app, context)
     add_result_pages(app, context)
     _add_proposals(app, context)
@@ -90,7 +92,21 @@ def _add_runs(app: FastAPI, context: PageContext) -> None:
             return await context.missing("run", id)
         screen = None if record is None else await context.read(run_screen, context.store, record, context.rules)
         report = None if screen is None or screen.document is None else shown(screen.document)
-        return await context.show("run.html", screen=screen, report=report)
+        return await context.show("run.html", screen=screen, report=report, words={"plot.read": current().translate("plot.read")})
+
+
+def _add_run_curve(app: FastAPI, context: PageContext) -> None:
+    @app.get("/run/curve", include_in_schema=False)
+    @needs(Permission.READ)
+    async def curve(id: Number = None, low: float = -1e12, high: float = 1e12) -> JSONResponse:
+        if not low < high:
+            return problem(422, "give a time that is not empty")
+        if id is None:
+            return JSONResponse(NOTHING)
+        try:
+            return JSONResponse(await context.read(run_curve, context.store, id, low, high))
+        except AbbeError as error:
+            return problem(404, error.detail, error.code)
 
 
 def _add_results(app: FastAPI, context: PageContext) -> None:

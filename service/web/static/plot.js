@@ -232,6 +232,69 @@ class Curve extends Box {
   }
 }
 
+// ---- the readings of a run: the service sends what a screen can show, and more of it as one zooms ------------------------------
+
+const PAUSE_MS = 120;
+
+class Readings extends Box {
+  static async of(box) {
+    const told = await readings(box.dataset.run);
+    if (!told || told.x.length < 2) return;
+    box.hidden = false;
+    const [x_name, y_name] = JSON.parse(box.dataset.labels);
+    new Readings(box, { ...told, key: box.dataset.name, x_name, y_name, unit: box.dataset.unit, y: told.high }, JSON.parse(box.dataset.words)).begin();
+    document.documentElement.dataset.plotted = "yes";
+  }
+
+  build() {
+    const { told } = this;
+    const colours = paint();
+    const host = this.box.querySelector("[data-part=main]");
+    host.replaceChildren();
+    const line = { stroke: colours.accent, width: 1, points: { show: false } };
+    this.main = new Plot(host, {
+      scales: { x: { time: false, range: (_, min, max) => [min, max] }, y: { range: (_, min, max) => uPlot.rangeNum(min, max, 0.08, true) } },
+      padding: [12, 12, 0, 0],
+      axes: axes(null, colours, told.y_name, told.x_name),
+      series: [{}, line, line],
+      bands: [{ series: [2, 1], fill: `${colours.accent}55` }],
+      hooks: { setScale: [(u, key) => key === "x" && this.ask()] },
+    }, [told.x, told.low, told.high], 320, (at) => this.tell(at));
+    this.main.whole = told.whole;
+  }
+
+  ask() {
+    clearTimeout(this.waiting);
+    this.waiting = setTimeout(async () => {
+      const { main, told } = this;
+      if (!main) return;
+      const [min, max] = main.range;
+      const found = await readings(this.box.dataset.run, min, max);
+      if (!found || main.range[0] !== min || main.range[1] !== max) return;
+      Object.assign(told, found, { y: found.high });
+      main.plot.setData([told.x, told.low, told.high], false);
+      main.plot.redraw();
+      this.box.dataset.shown = `${min} ${max}`;
+    }, PAUSE_MS);
+  }
+
+  say(k) {
+    const { told } = this;
+    const [low, high] = [told.low[k], told.high[k]].map(number);
+    this.out.textContent = fill(this.words["plot.read"], { at: `${number(told.x[k])} s`, value: low === high ? low : `${low} … ${high}`, unit: told.unit });
+  }
+
+  rows() {
+    const { told } = this;
+    return [[told.x_name, `low [${told.unit}]`, `high [${told.unit}]`], ...told.x.map((x, k) => [x, told.low[k], told.high[k]])];
+  }
+}
+
+async function readings(run, low = -1e12, high = 1e12) {
+  const answer = await fetch(`/run/curve?id=${run}&low=${low}&high=${high}`).catch(() => null);
+  return answer?.ok ? answer.json() : null;
+}
+
 // ---- the trend of a figure ------------------------------------------------------------------------------------------------------
 
 class Trend extends Box {
@@ -386,6 +449,7 @@ if (uPlot) {
   const words = list ? JSON.parse(list.dataset.words) : {};
   boxes.push(...[...document.querySelectorAll("[data-plot]")].map((box) => new Trend(box, words)));
   boxes.push(...[...document.querySelectorAll("[data-curve]")].map((box) => new Curve(box)));
+  document.querySelectorAll("[data-run]").forEach((box) => Readings.of(box));
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => boxes.forEach((one) => one.build()));
   document.documentElement.dataset.plotted = "yes";
 }

@@ -1,0 +1,60 @@
+"""The readings of a run for the script that zooms: the least and the largest of each part of the shown time, so that no peak is lost."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from abbe.models.arrays import F1
+from abbe.service.domain.document import Doc
+from abbe.service.runs.columns import load_run
+from abbe.service.storage.store import Store
+from abbe.service.web.frame import current
+
+NOTHING: Doc = {"x": [], "low": [], "high": [], "whole": [0.0, 0.0], "readings": 0}
+PARTS = 1000
+"""As many parts as a screen has columns, about; a shown time with fewer readings than twice that is sent reading by reading."""
+
+
+def envelope(x: F1, y: F1, low: float, high: float) -> tuple[F1, F1, F1]:
+    """Middle, least and largest reading of each part of ``x`` from ``low`` to ``high``; the readings themselves if there are few.
+
+    ``x``: growing, shape (n,). The last reading before and the first one after are taken along, so that lines reach the edges.
+    """
+    first = max(int(np.searchsorted(x, low)) - 1, 0)
+    last = min(int(np.searchsorted(x, high, side="right")) + 1, len(x))
+    x, y = x[first:last], y[first:last]
+    if len(x) <= 2 * PARTS:
+        return x, y, y
+    begins = np.linspace(0, len(x), PARTS, endpoint=False).astype(int)
+    ends = np.append(begins[1:], len(x)) - 1
+    return (x[begins] + x[ends]) / 2.0, np.minimum.reduceat(y, begins), np.maximum.reduceat(y, begins)
+
+
+def run_curve(store: Store, number: int, low: float, high: float) -> Doc:
+    """Deviation in the reader's unit against time, as read. Raises NotStored, StoreError, MeasurementFault."""
+    t_s, deviation_mm = _readings(store, number)
+    unit = current().drawn()
+    if not len(t_s):  # sealed: its readings are not here
+        return NOTHING
+    x, least, largest = envelope(t_s, deviation_mm, max(low, float(t_s[0])), min(high, float(t_s[-1])))
+    scale = 1e3 / unit.size
+    return {
+        "x": [float(f"{v:.9g}") for v in x],
+        "low": [float(f"{v:.5g}") for v in least * scale],
+        "high": [float(f"{v:.5g}") for v in largest * scale],
+        "whole": [float(t_s[0]), float(t_s[-1])],
+        "readings": len(t_s),
+    }
+
+
+@lru_cache(1)
+def _readings(store: Store, number: int) -> tuple[F1, F1]:
+    """The valid readings of the run that is being looked at; a stored run does not change."""
+    columns = load_run(store, number).columns
+    deviation_mm = np.empty(0) if columns.deviation_mm is None else columns.deviation_mm
+    t_s = columns.t_s[: deviation_mm.size]
+    good = columns.valid[: deviation_mm.size] & np.isfinite(deviation_mm)
+    order = np.argsort(t_s[good], kind="stable")
+    return t_s[good][order], deviation_mm[good][order]
