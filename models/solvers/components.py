@@ -12,6 +12,7 @@ prior of the error motions (`cautious`). The result is deterministic.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -158,12 +159,21 @@ class Components:
 class ComponentPosterior:
     """Solution for given components, in units of each unknown's prior standard deviation.
 
-    ``x`` (p,) most probable values; ``cov`` (p, p); ``log_evidence`` of the readings (constants left out).
+    ``x`` (p,) most probable values; ``low`` (p, p) lower triangular factor of their information; ``log_evidence`` of the readings
+    (constants left out).
     """
 
     x: F1
-    cov: F2
+    low: F2
     log_evidence: float
+
+    @cached_property
+    def cov(self) -> F2:
+        """Covariance of the unknowns, shape (p, p)."""
+        inverse, _ = scipy.linalg.lapack.dpotri(self.low, lower=1)  # its lower half only; the rest is the zeros of the factor
+        cov: F2 = inverse + inverse.T
+        np.fill_diagonal(cov, inverse.diagonal())
+        return cov
 
 
 def blend(sums: InformationSums, c: Components, half: F1) -> tuple[F2, F1, float]:
@@ -180,17 +190,14 @@ def posterior(sums: InformationSums, c: Components, model: SizeModel) -> Compone
     low = scipy.linalg.cholesky(gram, lower=True, overwrite_a=True, check_finite=False)
     z = scipy.linalg.solve_triangular(low, rhs, lower=True, check_finite=False)
     x = scipy.linalg.solve_triangular(low, z, lower=True, trans=1, check_finite=False)
-    inverse, _ = scipy.linalg.lapack.dpotri(low, lower=1)  # its lower half only; the rest is the zeros of the factor
-    cov = inverse + inverse.T
-    np.fill_diagonal(cov, inverse.diagonal())
     log_det = 2.0 * float(np.log(low.diagonal()).sum())
-    return ComponentPosterior(x, cov, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
+    return ComponentPosterior(x, low, -0.5 * (float(sums.count @ c.eta) + log_det + square - float(z @ z)))
 
 
 def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPosterior) -> tuple[F1, F2]:
     """Gradient of the log evidence and its expected information with respect to (psi, eta)."""
     half = c.half(model)
-    h, kinds = model.design.shape[1], range(c.eta.size)
+    h, kinds = model.design.shape[1], np.flatnonzero(sums.count > 0)
     w: F1 = np.exp(-c.eta)
     hat = -p.cov
     np.fill_diagonal(hat, hat.diagonal() + 1.0)
@@ -204,7 +211,7 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
         left = w[k] * (sums.square[k] - 2.0 * float(sums.rhs[k] @ own) + float(own @ sums.gram[k] @ own))
         trace = float(shares[k].trace())
         gradient[h + k] = 0.5 * (left + trace - float(sums.count[k]))
-        info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ji->i", p.cov, shares[k]) @ model.design
+        info[h + k, :h] = info[:h, h + k] = 0.5 * np.einsum("ij,ij->i", p.cov, shares[k]) @ model.design
         for m in kinds:
             info[h + k, h + m] = 0.5 * float(np.einsum("ij,ji->", shares[k], shares[m]))
         info[h + k, h + k] += 0.5 * (float(sums.count[k]) - 2.0 * trace)
@@ -212,12 +219,12 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
 
 
 def _information_shares(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
-    """Information of each instrument times the covariance; their sum is known (``hat``), so the last one is the rest."""
+    """Covariance times the information of each instrument; their sum is known (``hat``), so the last one is the rest."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
     rest = hat
     for k in used[:-1]:
-        out[k] = (sums.gram[k] * (w[k] * half[:, None] * half)) @ cov
+        out[k] = cov @ (sums.gram[k] * (w[k] * half[:, None] * half))
         rest = rest - out[k]
     out[used[-1]] = rest
     return out
@@ -292,13 +299,18 @@ def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tu
     """`estimate` with the correlation length of the error motions too, and with the share of their variance at the ends of the strokes.
 
     The smaller share is taken only if the log evidence gains `CLEAR`: where nothing was measured near the ends, a wrong one costs more
-    than a wide one. ``sums`` are those of the unknowns in units of their typical size.
+    than a wide one. It is tried at other lengths only if it gains at the best one of the usual share. ``sums`` are those of the
+    unknowns in units of their typical size.
     """
     usual, least = ENDS_SHARES
     best = _fit_length(sums, with_shapes(model, model.length, usual), start)
     if not model.blocks:
         return best
-    other = _fit_length(sums, with_shapes(model, best[0].length, least), best[1].components)
+    fewer = with_shapes(model, best[0].length, least)
+    found = estimate(sums.turned(fewer.root, fewer.turned), fewer, best[1].components)
+    if found.value <= best[1].value:
+        return best
+    other = _fit_length(sums, fewer, found.components)
     return other if other[1].value > best[1].value + CLEAR else best
 
 

@@ -266,12 +266,12 @@ def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term
     columns = np.concatenate([run_design(problem.machine, terms, r, problem.setup)[:, : len(terms)] for r in problem.runs])
     kind = problem.readings.kind
     weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
-    b = (columns * sizes.typical / problem.sigma[:, None]) @ sizes.root
+    b = columns * sizes.typical / problem.sigma[:, None]
     weighted = b * weight[:, None]
     root = fit.sizes.root * fit.components.half(fit.sizes)
-    across = weighted.T @ problem.readings.a @ root
-    information = b.T @ weighted - across @ fit.posterior.cov @ across.T
-    asked = weighted.T @ (fit.residual_mm / problem.sigma)
+    across = sizes.root.T @ (weighted.T @ problem.readings.a) @ root
+    information = sizes.root.T @ (b.T @ weighted) @ sizes.root - across @ fit.posterior.cov @ across.T
+    asked = sizes.root.T @ (weighted.T @ (fit.residual_mm / problem.sigma))
     return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
 
 

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from abbe.models.geometry.bases import SMOOTH_ORDER, rough_terms, smooth_terms
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_at, volume_frame, volume_grid
 from abbe.models.solvers.joint import solve_joint
@@ -13,7 +14,7 @@ from abbe.models.solvers.observe import run_design
 from abbe.models.uncertainty import prediction as module
 from abbe.models.uncertainty.inputs import STEEL_PER_K, StatedInputs
 from abbe.models.uncertainty.prediction import budget_over, compensable_mask, predict_deviation
-from abbe.models.uncertainty.sources import SOURCE_TEXTS, error_sources, omitted_prior_sd, response
+from abbe.models.uncertainty.sources import SOURCE_TEXTS, error_sources, omitted_prior_sd, omitted_terms, response
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 
 GRID = volume_grid(MACHINE.stroke_mm, 4)
@@ -175,6 +176,12 @@ def test_order_that_was_left_out_is_allowed_for(truth, runs):
         held.append(float((np.abs(missed) < p.expanded_mm).mean()))
     assert held[1] > 0.93
     assert held[0] < held[1] - 0.1
+
+
+def test_orders_are_omitted_above_smooth_motions_only():
+    smooth = smooth_terms(SMOOTH_ORDER)
+    assert {t.order for t in omitted_terms(smooth, 4)} == {13, 14, 15, 16}
+    assert omitted_terms((*smooth, *rough_terms()), 4) == ()
 
 
 def test_omitted_orders_cost_what_a_solution_with_them_says(solution, runs):
