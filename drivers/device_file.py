@@ -96,7 +96,7 @@ class IdentityRegisters(DeviceTable):
 
 
 class Flag(DeviceTable):
-    """What it means that a value has a bit set, or lies outside of limits (in the value's unit)."""
+    """Meaning of a set bit of a value, or of a value outside of limits (in its unit)."""
 
     value: str = Field(description="name of a value in [values]")
     bit: int | None = Field(default=None, ge=0, le=63)
@@ -160,7 +160,7 @@ class LineTable(DeviceTable):
 
 
 class PromisedLimits(DeviceTable):
-    """What the manual promises. Absent: not promised."""
+    """Limits promised by the manual. Absent: not promised."""
 
     rate_hz: float = Field(gt=0, le=1000, description="readings per second that the device allows")
     update_s: float | None = Field(default=None, gt=0, le=10, description="longest time for which the device shows an old value")

@@ -116,7 +116,7 @@ class BadDeviceFile(DriverError):
 
 
 class NotProved(DriverError):
-    """What a job needs is proved neither by the device file nor by the report of its test."""
+    """Neither the device file nor the report of its test proves an ability that the job needs."""
 
     code = "DRV-013"
 

@@ -77,7 +77,7 @@ def same_pose(a: RunData, b: RunData) -> bool:
 def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = False) -> VerificationFigure:
     """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
 
-    ``with_machine``: what the solution of the machine leaves, too, in place of the whole deviation. Without a calibrated length the common
+    ``with_machine``: the residual of the machine's solution in place of the whole deviation. Without a calibrated length the common
     scale is fitted, too. Noise and uncertainty of the form, which add to the squares, are taken out of the rms; its uncertainty is theirs.
     """
     p = run.points

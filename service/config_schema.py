@@ -400,7 +400,7 @@ class Signatures(ConfigTable):
 
 
 class AlarmSection(ConfigTable):
-    """When scheduled checks raise an alarm before a limit is exceeded, and what the service may do about it by itself."""
+    """When scheduled checks raise an alarm before a limit is exceeded, and the reactions that the service may start by itself."""
 
     warn_days: float = Field(
         default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within this many days (lower end, 95 %); 0: never"

@@ -467,7 +467,7 @@ class Mistake:
 
     @property
     def expected(self) -> str:
-        """One line: what was expected and what was found."""
+        """One line: the expected and the found value."""
         plain = self.message.removeprefix("Value error, ")
         plain = plain.replace("Input should be a valid", "expected a").replace("Input should be", "expected")
         for noun in ("integer", "array", "object"):

@@ -20,7 +20,7 @@ from abbe.service.sequences.nc.write import NcSettings
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """What a workflow needs to know about a machine. ``doc``: the machine object (docs/schemas/machine.schema.json).
+    """Facts about a machine for a workflow. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
     ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and

@@ -22,7 +22,7 @@ class FixtureError(ValueError):
 
 
 class Box(Protocol):
-    """What the fixture offers only to tests: logs of commands and samples, and the cable of the ball-bar's box."""
+    """Access for tests only: logs of commands and samples, and the cable of the ball-bar's box."""
 
     def ledger(self) -> Answer:
         """Return the numbers of samples sent and dropped since the last START, and the fates of all samples."""

@@ -68,7 +68,7 @@ class Magnitudes:
 
 @dataclass(frozen=True, slots=True)
 class BallbarConfig:
-    """How the ball-bar's box is reached: ``pty`` (serial line) or ``tcp``; port 0 = any free one."""
+    """Connection of the ball-bar's box: ``pty`` (serial line) or ``tcp``; port 0 = any free one."""
 
     transport: str = "pty"
     port: int = 0
@@ -76,7 +76,7 @@ class BallbarConfig:
 
 @dataclass(frozen=True, slots=True)
 class LaserConfig:
-    """How the laser is reached: ``tcp`` (Modbus TCP) or ``rtu`` (Modbus RTU on a pty); port 0 = any free one."""
+    """Connection of the laser: ``tcp`` (Modbus TCP) or ``rtu`` (Modbus RTU on a pty); port 0 = any free one."""
 
     transport: str = "tcp"
     port: int = 0

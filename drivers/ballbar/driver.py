@@ -383,7 +383,7 @@ class SerialBallBar:
 
     @property
     def backlog(self) -> float:
-        """How full the ring buffer between reading and storing is, 0 to 1."""
+        """Fill level of the ring buffer between reading and storing, 0 to 1."""
         return 0.0 if self._framing is None else self._framing.ring.fill
 
     async def _batches(self, stream: Stream, timeout_s: float) -> AsyncIterator[BarBatch]:

@@ -1,1 +1,1 @@
-"""`abbe device test`: what a device does, and what Abbe makes of late, doubled, spoilt and missing replies."""
+"""`abbe device test`: behaviour of a device, and of its driver with late, doubled, spoilt and missing replies."""

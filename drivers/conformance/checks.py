@@ -1,4 +1,4 @@
-"""The checks of a device test. Each returns findings; none raises for what the device does wrong."""
+"""The checks of a device test. Each returns findings; faults of the device raise no errors."""
 
 from __future__ import annotations
 
@@ -187,7 +187,7 @@ async def _words(probe: DeviceUnderTest, name: str) -> tuple[int, ...]:
 
 
 def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
-    """Name what is wrong with a motion as it was read, and ``where`` to mend it; empty if nothing is wrong."""
+    """Return the fault of a motion as it was read, and ``where`` to correct it; empty without a fault."""
     if abs(got_mm - move.mm) <= move.tolerance_mm:
         return ""
     read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"

@@ -57,7 +57,7 @@ AT_REST, NOISES = 10, 10.0
 
 @dataclass(frozen=True, slots=True)
 class _Rest:
-    """What a device reads at rest: number of the last reading, mean values, and how far from them a right reading may be."""
+    """Readings of a device at rest: number of the last one, mean values, and the tolerance of a right reading."""
 
     number: int
     values: Mapping[str, float]
@@ -157,7 +157,7 @@ MOTIONS = {"displacement": _METER, "laser": _METER, "ballbar": ("motion radius",
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """How a device is tested. ``role``: of a device with a driver, laser, ballbar or cnc; ``move``, ``ask``: None without a person."""
+    """Options of a device test. ``role``: of a device with a driver, laser, ballbar or cnc; ``move``, ``ask``: None without a person."""
 
     role: str = "laser"
     move: Move | None = None
@@ -220,7 +220,7 @@ def _report(text: str, about: Described | None, role: str, info: DeviceInfo, fou
 
 
 def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
-    """Return what a device can be used for by the findings of its test.
+    """Return the abilities of a device by the findings of its test.
 
     A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was, and if no check failed.
     No test of a file proves motion or tables: that is up to a driver and `abbe comp commission`.
@@ -234,7 +234,7 @@ def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
 
 
 def summary(report: TestReport) -> str:
-    """Return in one line what the device can be used for."""
+    """Return the abilities of the device in one line."""
     if report.failed:
         return "it cannot be used: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:

@@ -20,7 +20,7 @@ _IDLE_S = 0.2
 
 
 class Fault(StrEnum):
-    """What happens to the next reply."""
+    """Fault applied to the next reply."""
 
     LATE = "late"
     DOUBLED = "doubled"

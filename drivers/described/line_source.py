@@ -1,7 +1,7 @@
 """A described device that sends lines of text, when asked or by itself, over a serial port or TCP.
 
 A line has no number and seldom a check sum. So a late answer must never pass for the next one: after a disturbance the line has to be
-silent for a whole timeout, and what came unasked is dropped before a question.
+silent for a whole timeout, and unsolicited bytes are dropped before a request.
 """
 
 from __future__ import annotations

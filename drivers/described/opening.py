@@ -1,4 +1,4 @@
-"""Opens described devices: the wire from the URL, the rest from the device file; for a job only what the report of its test proves."""
+"""Opens described devices: the wire from the URL, the rest from the device file; for a job only with tested abilities."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What all described devices have in common: a coherent set of counts, what it means by the device file, and how it is asked for."""
+"""Parts common to all described devices: a coherent set of counts, its interpretation by the device file, and the request for it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a device can do by the report of its test (`abbe device test`), and the gate: a job opens only what was proved for it."""
+"""Abilities of a device by the report of its test (`abbe device test`); a job opens only devices with the abilities that it needs."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ FORMAT = "abbe-device-test/1"
 
 
 class Ability(StrEnum):
-    """What a device can be used for; the second needs more proofs.
+    """Use of a device; the second needs more proofs.
 
     No report of this test lets a device command motion or hold tables: that takes a driver of its own, whose banks, read-back and
     compare-and-swap `abbe comp commission` proves.

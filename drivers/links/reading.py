@@ -176,7 +176,7 @@ class ReadingThread:
                 return True, None
 
     def _read_rest(self) -> None:
-        """Read what the kernel still holds when the line closes: it may be the end of a run."""
+        """Read the bytes that the kernel still holds when the line closes: they may be the end of a run."""
         left = self._ring.capacity
         with suppress(OSError):
             while left > 0 and (data := os.read(self._descriptor, _READ_BYTES)):

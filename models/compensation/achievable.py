@@ -80,7 +80,7 @@ class MotionTables:
     any_tool: bool
 
     def correction_at(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
-        """Return what a control adds to commanded positions, mm, shape (n, 3): linear between nodes, with the levers of rule G."""
+        """Return the corrections of a control at commanded positions, mm, shape (n, 3): linear between nodes, with the levers of rule G."""
         values = np.zeros((axes_mm.shape[0], 3, 6))
         for name, table in self.motions.items():
             axis, component = PLACES[name]

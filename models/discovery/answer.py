@@ -24,7 +24,7 @@ class Significance:
 
 @dataclass(frozen=True)
 class Localization:
-    """Where a gap or an effect is located; None or empty: not located in this respect. The fields are those of ``where`` in
+    """Location of a gap or an effect; None or empty: not located in this respect. The fields are those of ``where`` in
     docs/schemas/discovery.schema.json. ``shape``: form of the deviation, as text. ``table``: all tests."""
 
     tests: tuple[str, ...] = ()
@@ -117,7 +117,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A blind spot of a campaign: ``what`` its runs cannot show, ``because`` of what, and the measurement that would (``adds``)."""
+    """A blind spot of a campaign: ``what`` its runs cannot show, the reason ``because``, and ``adds``, the measurement that would."""
 
     what: str
     because: str

@@ -235,7 +235,7 @@ def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
 
 
 def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
-    """Return the whitened columns of a pick and what the projection leaves of them, using the problem's cache."""
+    """Return the whitened columns of a pick before and after the projection, using the problem's cache."""
     name = pick.start
     if name not in problem.column_cache:
         if len(problem.column_cache) >= MOST_CACHED:

@@ -414,7 +414,7 @@ class Changed:
 
 
 def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
-    """Name what has changed in a machine since it was solved.
+    """Name the changes of a machine since it was solved.
 
     Parameters
     ----------

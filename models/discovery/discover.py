@@ -90,7 +90,7 @@ def _burst(problem: WhitenedProblem, t0_s: float, width_s: float) -> F1:
 
 
 def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | None = None) -> Discovery:
-    """Find what the present simulation of a campaign misses.
+    """Find the effects that the present simulation of a campaign lacks.
 
     Parameters
     ----------

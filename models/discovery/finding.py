@@ -286,7 +286,7 @@ def _judge(
     rivals: Sequence[Sequence[Rival]],
     rest: float,
 ) -> _Judgement:
-    """Sort the findings into named effects, structures without a name, and residues of other effects or of what nothing explains.
+    """Sort the findings into named effects, structures without a name, and residues of other effects or of unexplained residuals.
 
     ``rest``: evidence, in nats, of what all findings together leave above the noise.
     """

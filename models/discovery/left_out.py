@@ -1,4 +1,4 @@
-"""How far a finding closes the gap on blocks of runs that are left out in turn, for campaigns without holdout runs."""
+"""Share of the gap that a finding closes on blocks of runs left out in turn, for campaigns without holdout runs."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[s
 
 
 def _left(problem: WhitenedProblem, effects: F2, sd: F1) -> F1:
-    """Return what the fits to the other blocks leave of every reading, mm, shape (n,); ``effects``: columns (n, k), mm per unit."""
+    """Return the residual of every reading from fits to the other blocks, mm, shape (n,); ``effects``: columns (n, k), mm per unit."""
     block = np.concatenate([(BLOCKS * np.arange(n) // n + i) % BLOCKS for i, n in enumerate(problem.lengths)])
     tangent, p = problem.tangent, problem.base.size
     read = problem.gap + tangent.raw @ problem.theta

@@ -28,16 +28,16 @@ REFERENCE_C = 20.0
 
 
 class Strain(Protocol):
-    """What the temperature added to deviations along a line, mm per mm of travel, and its standard uncertainties (`Expansion`)."""
+    """Thermal part of deviations along a line, mm per mm of travel, and its standard uncertainties (`Expansion`)."""
 
     @property
     def strain(self) -> float:
-        """What was added."""
+        """The thermal part."""
         ...
 
     @property
     def u_as_measured(self) -> float:
-        """Standard uncertainty of what was added, at exactly the stated temperature."""
+        """Standard uncertainty of the thermal part, at exactly the stated temperature."""
         ...
 
     @property
@@ -61,7 +61,7 @@ class Expansion:
     laser_per_k: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what is not a number.
+        """Refuse values that are not numbers.
 
         Raises
         ------
@@ -80,14 +80,14 @@ class Expansion:
 
     @property
     def strain(self) -> float:
-        """What the temperature added to the deviation, mm per mm of travel: (scale - laser) (t - 20); positive: the axis goes too far."""
+        """Thermal part of the deviation, mm per mm of travel: (scale - laser) (t - 20); positive: the axis goes too far."""
         return (self.scale_per_k - self.laser_per_k) * self.rise_k
 
     @property
     def u_as_measured(self) -> float:
         """Standard uncertainty of the deviation as measured at exactly ``temperature_c``, mm per mm.
 
-        u² = ((scale - laser) u(t))² + (laser u(t))²: error of ``temperature_c``, and of what the laser's own sensor made it take off.
+        u² = ((scale - laser) u(t))² + (laser u(t))²: error of ``temperature_c``, and of the laser's compensation by its own sensor.
         """
         return float(np.hypot(self.scale_per_k - self.laser_per_k, self.laser_per_k)) * self.u_temperature_k
 
@@ -113,7 +113,7 @@ class DiagonalExpansion:
 
     @property
     def strain(self) -> float:
-        """What the temperature added to the deviation, mm per mm of travel along the diagonal."""
+        """Thermal part of the deviation, mm per mm of travel along the diagonal."""
         return sum(share * one.strain for one, share in zip(self.axes, self.shares, strict=True))
 
     @property

@@ -46,7 +46,7 @@ OBLIQUE = 0.5
 
 @dataclass(frozen=True, slots=True)
 class SetupMinutes:
-    """How long a person needs for each set-up, minutes; the defaults are typical values.
+    """Time that a person needs for each set-up, minutes; the defaults are typical values.
 
     Attributes
     ----------

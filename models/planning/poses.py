@@ -1,4 +1,4 @@
-"""What poses of a probed artefact leave unknown of the machine in their plane: the posterior bound, with a free form of the artefact.
+"""Uncertainty that poses of a probed artefact leave in their plane of the machine: the posterior bound, with a free form of the artefact.
 
 Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share unknowns, the form of the artefact, so all of them
 count at once.

@@ -1,1 +1,1 @@
-"""Solve observations for error parameters with uncertainty, and find what the observations cannot determine."""
+"""Solve observations for error parameters with uncertainty, and find the parameters that the observations cannot determine."""

@@ -71,7 +71,7 @@ class Fine:
 
 @dataclass(frozen=True, eq=False)
 class ArtefactPoints:
-    """What a run of an artefact has besides the columns of every run; one row per component of a point.
+    """Data of an artefact's run besides the columns of every run; one row per component of a point.
 
     Attributes
     ----------

@@ -1,4 +1,4 @@
-"""What goes wrong when an artefact is measured: exchanged features, a pose that is a quarter turn off, an artefact that moved, a false
+"""Faults in the measurement of an artefact: exchanged features, a pose that is a quarter turn off, an artefact that moved, a false
 trigger, a wrong radius, a part that twists. Each is named, and corrected where the readings determine the correction."""
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ RADIUS_MM, TWIST_MM, SIGMA = 8e-3, 6e-3, 4.0
 
 @dataclass(frozen=True, slots=True)
 class ArtefactFault:
-    """A fault of one run, in words, and what was done about it."""
+    """A fault of one run and its correction, as text."""
 
     run: str
     what: str
@@ -48,7 +48,7 @@ class ArtefactFault:
 
 
 def undone(runs: tuple[RunData, ...], settle: Settle) -> tuple[tuple[RunData, ...], list[ArtefactFault]]:
-    """Return the runs with exchanged features, quarter turns and motions undone, and what was found; ``settle`` solves runs."""
+    """Return the runs with exchanged features, quarter turns and motions corrected, and the faults; ``settle`` solves runs."""
     runs, found = relabelled(runs)
     problem, fit = settle(runs)
     for _ in range(len(runs)):

@@ -1,4 +1,4 @@
-"""What moves with an artefact and what stays with the machine: the named fields of a plane, in each of the two, with U and evidence.
+"""Errors that move with an artefact and errors of the machine: the named fields of a plane, in each of the two, with U and evidence.
 
 The form of the artefact and the map of the machine are unknowns of one solution; the poses tell them apart, or not. A field that the poses
 hide (`abbe.models.solvers.observability.poses`) is unknown if it is there at all: its split would be that of the priors.
@@ -33,7 +33,7 @@ Verdict = Literal["with the part", "with the machine", "with both", "unknown", "
 class Share:
     """A field's amount at ``reach_mm`` from the centre, mm: of the part and of the machine, their standard uncertainties, evidence.
 
-    ``both_mm``, ``u_both_mm``: what the part shows on this machine (part minus machine, as a probe reads it).
+    ``both_mm``, ``u_both_mm``: the reading of the part on this machine (part minus machine, as a probe reads it).
     """
 
     field: str

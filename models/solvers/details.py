@@ -1,7 +1,7 @@
-"""What no smooth or rough basis follows: details of a motion at the places of a step test, each an unknown of its own.
+"""Details of a motion that neither a smooth nor a rough basis follows: one unknown per place of a step test.
 
 A screw with a lead of 10 mm, read every 40 mm, looks like a slow wave. Four step diagonals stop at the same places of each axis, so the
-deviation of a motion at such a place is common to them, and an unknown of its own keeps it out of the smooth motions.
+deviation of a motion at such a place is common to them, and a separate unknown keeps it out of the smooth motions.
 """
 
 from __future__ import annotations

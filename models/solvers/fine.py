@@ -39,7 +39,7 @@ POLYNOMIAL = 5
 
 @dataclass(frozen=True)
 class Score:
-    """What further unknowns would explain of the readings, given everything that the fit already explains (Rao's score)."""
+    """Part of the residuals that further unknowns would explain (Rao's score)."""
 
     weight: F1
     left: F1
@@ -99,7 +99,7 @@ def refined(problem: CampaignProblem, fit: CampaignFit, solve: Solve) -> tuple[C
 
 
 def _noisy(problem: CampaignProblem, fit: CampaignFit) -> bool:
-    """Whether probed points scatter more than they repeat; what a workpiece scatters is that of its drilling."""
+    """Whether probed points scatter more than they repeat; a workpiece scatters by its drilling."""
     probed = any(r.points is not None and r.points.source == "probe" for r in problem.runs)
     return probed and float(np.exp(0.5 * fit.components.eta[KINDS.index("artefact")])) > NOISY
 

@@ -1,8 +1,9 @@
 """One joint solution of ball-bar and laser runs: 21 error motions, lost motion, and every set-up error as an unknown.
 
 Published methods solve the data sets one by one and take the set-ups as perfect. Here cup offsets, bar lengths, mirror tilts, laser zeros
-and drifts are unknowns with documented priors (`abbe.models.solvers.priors`), and the solution lists what the data cannot separate. The
-noise of the instruments and the size of each class of errors are estimated as well (docs/decisions/0011-sizes-from-the-data.md).
+and drifts are unknowns with documented priors (`abbe.models.solvers.priors`), and the solution lists
+parameters that the data cannot separate. The noise of the instruments and the size of each class of errors are estimated as well
+(docs/decisions/0011-sizes-from-the-data.md).
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ Model = Literal["rigid6", "rigid21", "auto"]
 
 @dataclass(frozen=True)
 class RunFit:
-    """How one run was fitted: residuals in the order of its (averaged) readings, their rms, and the rms that was expected, mm."""
+    """Fit of one run: residuals in the order of its (averaged) readings, their rms, and the rms that was expected, mm."""
 
     label: str
     kind: str
@@ -227,7 +228,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
 
 
 def settled_points(machine: Machine, runs: tuple[RunData, ...], priors: Priors) -> tuple[CampaignProblem, CampaignFit]:
-    """Settle a campaign of artefacts with smooth motions only: what a search for faults needs."""
+    """Settle a campaign of artefacts with smooth motions only, for the search for faults."""
     return _again(machine, smooth_terms(SMOOTH_ORDER), runs, replace(priors, pooled=True), expected_noise(runs, None, None), _silent)
 
 

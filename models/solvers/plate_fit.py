@@ -42,7 +42,7 @@ class PlateFit:
 
     @property
     def verdict(self) -> str:
-        """What the plate shows beyond a rigid motion."""
+        """Deviations of the plate beyond a rigid motion."""
         there = np.abs(self.value) > CLEAR * self.expanded
         if there[3]:
             return (

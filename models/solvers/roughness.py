@@ -1,4 +1,4 @@
-"""What part of a machine is rough: the size of each motion's rough part, and periods such as the lead of a screw.
+"""Roughness of a machine: the size of each motion's rough part, and periods such as the lead of a screw.
 
 A period is looked for in the residuals of a solution, one translational motion at a time. It is claimed only if it gains far more than the
 best of as many periods would by chance, and if no other period explains the readings about as well (readings at steps of one length cannot

@@ -1,1 +1,1 @@
-"""The audit: who did what to what, when, and how it ended. Each record is chained to the one before and sealed with a key kept outside."""
+"""The audit: person, action, target, time and outcome. Each record is chained to the one before and sealed with a key kept outside."""

@@ -177,7 +177,7 @@ SERVER_HELP = "copy it with pg_dump --format=custom, bring it back with pg_resto
 
 @dataclass(frozen=True, slots=True)
 class BackupSource:
-    """What to back up: the database, the capture's folder of samples not yet in it, and optionally the machine file."""
+    """Parts of a backup: the database, the capture's folder of samples not yet in it, and optionally the machine file."""
 
     url: str
     capture: CaptureSettings

@@ -25,7 +25,7 @@ SQLITE_SUFFIXES = ("", "-journal", "-wal", "-shm")
 
 @dataclass(frozen=True, slots=True)
 class Restored:
-    """What was restored. ``aside``: new paths of the files that were there before."""
+    """Result of a restore. ``aside``: new paths of the previous files."""
 
     backup: Backup
     database: Path

@@ -21,7 +21,7 @@ STILL_MM = 1e-6
 
 
 def lines_of(made: FoundThinning) -> tuple[str, ...]:
-    """Describe the decimation: what was done, what it hides, and the remedy."""
+    """Describe the decimation: its size, the effects that it hides, and the remedy."""
     each, means = made.readings_per_value, made.how == "means"
     became = f"every {each} of them were averaged" if means else f"one of every {each} was used, unaveraged"
     done = f"{made.readings} ball-bar readings are too many to search one by one: {became}, {made.kept} values in all"

@@ -37,7 +37,7 @@ def run_digest(run: Run) -> str:
 
 
 def with_changed_readings(run: Run, deviation_mm: F1, removed: str) -> Run:
-    """Return the run with new readings, the digest of its measured data, and a description of what was subtracted."""
+    """Return the run with new readings, the digest of its measured data, and descriptions of the subtracted effects."""
     changed = run.with_readings(deviation_mm)
     return replace(changed, measured_digest=measured_digest(run), subtracted=(*run.subtracted, removed))
 
@@ -55,7 +55,7 @@ def removals_of(runs: list[Run]) -> list[str]:
 def whole_run_digest(run: Run) -> str:
     """Return the SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
 
-    Changed readings enter by the digest of the measured ones and the descriptions of what was subtracted, because the subtracted values may
+    Changed readings enter by the digest of the measured ones and descriptions of the subtracted effects, because the subtracted values may
     differ in the last digit between computers.
     """
     out = hashlib.sha256(json.dumps([run.run_id, run.test, run.role, run.machine, run.setup.document], sort_keys=True).encode())

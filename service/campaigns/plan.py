@@ -123,7 +123,7 @@ BOUND_NOTE = (
 
 @dataclass(frozen=True)
 class PlannedCampaign:
-    """A plan with its recipes, campaign, dry run of every test, and recipe file text; ``notes``: what a person should know beforehand."""
+    """A plan with its recipes, campaign, dry run of every test, and recipe file text; ``notes``: remarks for the person."""
 
     plan: MeasuringPlan
     recipes: tuple[Recipe, ...]

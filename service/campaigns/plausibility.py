@@ -186,7 +186,7 @@ def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausi
 
 
 def _device_files(site: Site) -> list[str]:
-    """Return what is wrong with the device files that the addresses name; no device is connected."""
+    """Return faults of the device files that the addresses name; no device is connected."""
     found = []
     for role in (CNC, LASER, BALLBAR):
         url = getattr(site.urls, role)

@@ -1,4 +1,4 @@
-"""What all commands share by their form: help in groups that is never cut, and ``--out FILE`` for what would go to standard output."""
+"""Form common to all commands: help in groups that is never cut, and ``--out FILE`` in place of standard output."""
 
 from __future__ import annotations
 

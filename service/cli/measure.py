@@ -168,7 +168,7 @@ def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleOptions:
-    """What the person stated by options: ``resume`` a campaign; the set-up is ``untouched``; the unknown table in force is right."""
+    """Statements of the person by options: ``resume`` a campaign; the set-up is ``untouched``; the unknown table in force is right."""
 
     resume: bool
     untouched: bool

@@ -22,7 +22,7 @@ HAIR = 1e-6
 
 @dataclass(frozen=True, slots=True)
 class Rehearsal:
-    """What to do instead of measuring: a dry run, optionally with all positions or a picture, or an NC program in the dialect ``nc``."""
+    """Replacement of a measurement: a dry run, optionally with all positions or a picture, or an NC program in the dialect ``nc``."""
 
     dry_run: bool
     path: bool

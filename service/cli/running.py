@@ -151,7 +151,7 @@ def display() -> Iterator[ProgressSink]:
 
 
 def _waits(p: Progress) -> str:
-    """Return what a measurement waits for; empty while it runs."""
+    """Return the reason why a measurement waits; empty while it runs."""
     return f"{p.state}: {p.why}" if p.state in ("paused", "suspended") else ""
 
 

@@ -53,7 +53,7 @@ class SignCommissioning:
 
 @dataclass
 class CommissioningContext:
-    """What one commissioning needs: open devices, database, machine, and the places that the ball-bar reads."""
+    """Context of one commissioning: open devices, database, machine, and the places that the ball-bar reads."""
 
     session: Session
     store: Store
@@ -79,7 +79,7 @@ class CommissioningContext:
 
 
 async def commission(session: Session, store: Store, site: Site, *, progress: ProgressSink) -> SignCommissioning:
-    """Measure what the control does with a correction. Takes about ten minutes of machine time and one mounting of cup and bar.
+    """Measure the effect of a correction at the control. Takes about ten minutes of machine time and one mounting of cup and bar.
 
     Any interlock ends it, even one that the machine file lets a measurement wait for, because a test table is in force.
 

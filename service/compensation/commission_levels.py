@@ -229,7 +229,7 @@ SHORT_LEASE_MS, RUNS_OUT_S, POLL_S = 300, 5.0, 0.05
 
 @dataclass(frozen=True, slots=True)
 class ProvedLevels:
-    """The proved capabilities of a controller. ``shown``: every observation; ``not_shown``: what this test cannot show."""
+    """The proved capabilities of a controller. ``shown``: every observation; ``not_shown``: capabilities that this test cannot show."""
 
     capabilities: Capabilities
     shown: tuple[FlagObservation, ...]

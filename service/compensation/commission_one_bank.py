@@ -1,6 +1,6 @@
 """Commissioning of a control with one table at its lower level, which a person asks for by name (`abbe comp commission --one-bank`).
 
-What the exchange of tables relies on is attempted with a copy of the table in force: the control has to refuse writes while its table acts,
+The assumptions of the exchange are tested with a copy of the table in force: the control has to refuse writes while its table acts,
 and switches with a wrong CRC. Compensation is off for some tenths of a second, while the machine stands; an axis may move by its present
 correction.
 """

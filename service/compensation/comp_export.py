@@ -69,7 +69,7 @@ def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identifie
     FileFormatError
         The document holds no coefficients, or no machine.
     FormatRefused
-        The scales are not what the solution knows worst.
+        The scales are not the least certain part of the solution.
     """
     for key, what in (("prediction", "coefficients"), ("machine", "machine")):
         if not isinstance(doc.get(key), dict):
@@ -186,7 +186,7 @@ MOTIONS_ADD_UP = 6.0
 
 
 def sign_is_turned(step_moved_um: float | None) -> bool | None:
-    """Return what the 10 µm step proved: the sign is as we write it (False), or turned (True); None if it was not measured.
+    """Return the result of the 10 µm step: the sign is as written (False) or reversed (True); None if it was not measured.
 
     Raises
     ------
@@ -225,7 +225,7 @@ def export(
     holds_at : str
         Temperature of the scales at which the solution holds.
     turned : bool, optional
-        What the 10 µm step proved (`sign_is_turned`); acts on formats whose sign no manual states.
+        Result of the 10 µm step (`sign_is_turned`); acts on formats whose sign no manual states.
 
     Raises
     ------
@@ -452,7 +452,7 @@ class SealStatus:
 
 @dataclass(frozen=True, slots=True)
 class SigningRequest:
-    """What an import expects of a signature.
+    """Requirements of an import on a signature.
 
     ``form``: format of the files; ``trusted``: public keys besides those of the machine file; ``base``: fingerprint of the table that was
     active while measuring, None: any.
@@ -470,7 +470,7 @@ def signature_file(path: Path) -> Path:
 
 @dataclass(frozen=True, slots=True)
 class TableSeal:
-    """How a person signs: file of the key, days of validity, and fingerprint of the table that was active while measuring."""
+    """Signature of a person: file of the key, days of validity, and fingerprint of the table that was active while measuring."""
 
     key: Path
     days: float

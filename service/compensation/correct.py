@@ -93,7 +93,7 @@ async def correct(context: PushContext, campaign: str | int, before: list[Run], 
     TableRefused
         A limit is exceeded, or the tables promise too little: nothing was written.
     TableMismatch
-        Runs were measured with another table than the active one, or the controller does not hold what was sent.
+        Runs were measured with another table than the active one, or the controller does not hold the table that was sent.
     StillActive
         An unverified table could not be rolled back yet.
     """
@@ -172,7 +172,7 @@ def _misfit_mm(solved: Solved, before: list[Run], table: NineTables | None) -> f
 
 
 def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
-    """Prepare a run as the solved runs were prepared: remove what the table in force did beyond its smooth corrections."""
+    """Prepare a run like the solved runs: remove the effect of the table in force beyond its smooth corrections."""
     if table is None:
         return run
     lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])

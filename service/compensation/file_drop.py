@@ -31,7 +31,7 @@ LOOK = "look at it; nothing was written"
 
 @dataclass(frozen=True, slots=True)
 class Drop:
-    """What was put where. ``files``, ``before``: SHA-256 by name; "" for a file that was not there.
+    """Receipt of a drop. ``files``, ``before``: SHA-256 by name; "" for a file that was not there.
 
     ``state``: "writing", "written" (and read back), "taken back", "confirmed"; ``seen_by``: a person who says that the tables were loaded.
     """

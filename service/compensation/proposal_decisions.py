@@ -64,7 +64,7 @@ def status_of_proposal(
 
 
 def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
-    """How the proposal's last push ended; None if that push ended before the new table was in force."""
+    """End of the proposal's last push; None if that push ended before the new table was in force."""
     last, f = own[-1], facts(own)
     if last.state in (PushState.REJECTED, PushState.ABORTED):
         return None

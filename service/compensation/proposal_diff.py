@@ -1,4 +1,4 @@
-"""How two sets of tables differ: nine curves on one grid, the largest change with its place, and a report."""
+"""Difference of two sets of tables: nine curves on one grid, the largest change with its place, and a report."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ def largest(found: TableDifference) -> str:
 
 
 def diff_report(found: TableDifference, proposed: Proposed) -> Document:
-    """The report of what a proposal changes: numbers and curves."""
+    """Report of the changes of a proposal: numbers and curves."""
     p = proposed.predicted
     lead = (
         f"{proposed.candidate.machine}: {found.new}, made from campaign {proposed.campaign} by {proposed.by} at {proposed.utc}.",

@@ -154,7 +154,7 @@ GRID = (25, 21, 19)
 
 @dataclass(frozen=True)
 class Proposal:
-    """Tables from a campaign (absolute, rounded), what they add to the tables in force (``change``, unrounded), and the prediction.
+    """Tables from a campaign (absolute, rounded), their addition to the tables in force (``change``, unrounded), and the prediction.
 
     ``left_out``: what was left out of the tables, in words.
     """
@@ -272,7 +272,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
 
 
 def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTables, Predicted, tuple[str, ...]]:
-    """Return what a solution adds to the tables in force, the prediction, and what is left out, in words; as for `propose`."""
+    """Return the tables that a solution adds to those in force, the prediction, and omissions as text; arguments as for `propose`."""
     if only_artefacts(solved.joint):
         return _change_where_touched(solved)
     if not without_scale:

@@ -65,7 +65,7 @@ async def level_status(controller: Identity, store: Store, site: Site) -> LevelS
 
 
 async def _visible(controller: Identity) -> Capabilities:
-    """What the status block shows without a test: two banks, a generation, a boot id. None of it is proved.
+    """Features that the status block shows without a test: two banks, a generation, a boot id. None of it is proved.
 
     A control with one table shows nothing: its level is only ever given by name (`abbe comp commission --one-bank`).
     """

@@ -89,7 +89,7 @@ class Questions:
 
 @dataclass(frozen=True, slots=True)
 class PushResult:
-    """How a push ended: the new table is kept, or the old one is in force again. ``log``: every transition, for people."""
+    """Result of a push: the new table is kept, or the old one is in force again. ``log``: every transition, for people."""
 
     push_id: int
     table_id: int

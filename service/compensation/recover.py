@@ -71,7 +71,7 @@ async def finish_push(
     Returns
     -------
     str or None
-        What was done; None if there was nothing to do.
+        Summary of the actions; None if there was nothing to do.
 
     Raises
     ------
@@ -310,7 +310,7 @@ async def finish_when_safe(
     Returns
     -------
     str or None
-        What was done; None if nothing was left to do.
+        Summary of the actions; None if there was nothing to do.
 
     Raises
     ------

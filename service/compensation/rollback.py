@@ -52,7 +52,7 @@ class RollbackResult:
 
 @dataclass(frozen=True, slots=True)
 class RollbackRequest:
-    """Who orders a rollback, why, under which order number, and what may stop it. Stored with the table and in the push journal."""
+    """Order of a rollback: person, reason, number, and the control that may stop it. Stored with the table and in the push journal."""
 
     who: str
     reason: str

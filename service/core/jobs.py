@@ -284,7 +284,7 @@ class JobRegistry:
         return _answer(asked.request, "done", "", asked.job)
 
     async def done_by_hand(self, asked: ConfirmPrompt) -> Answer:
-        """Confirm that a person has done what the open prompt of a job asks for."""
+        """Confirm that a person has carried out the open prompt of a job."""
         entry = await self._asked_of(asked, Permission.MEASURE)
         if isinstance(entry, Answer):
             return entry

@@ -1,7 +1,7 @@
 """Orders of people, run as jobs: a full campaign, a rollback to the previous table, or the push of an approved proposal.
 
 Rights are decided here. The audit records who ordered and why before anything is done, and afterwards how it ended. The end of a push is
-read from the push journal, whatever was reported.
+read from the push journal, not from reports.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
 
 @dataclass(frozen=True, slots=True)
 class OrderActions:
-    """What carries out the orders: a rollback, a push of an approved proposal; None: this order is not possible here."""
+    """Functions that carry out the orders: a rollback, a push of an approved proposal; None: this order is not possible here."""
 
     ordered_rollback: OrderedRollback | None = None
     push: Push | None = None
@@ -151,7 +151,7 @@ class _TableOrderJob(_OrderJob):
 def full_campaigns(
     context: OrderContext, names: tuple[str, ...], measure: MeasureCampaign, may: Callable[[str], Awaitable[bool]]
 ) -> FullCampaigns:
-    """Return what the registry of jobs needs to start full campaigns.
+    """Return the entry of full campaigns for the registry of jobs.
 
     Parameters
     ----------

@@ -60,7 +60,7 @@ class ServiceSetup:
     rules : Rules
         Limits, certificates and temperatures that reports add to the data.
     duties : callable, optional
-        Given the store, returns what the service does about alarms; None: it raises no alarms.
+        Given the store, returns the reactions of the service to alarms; None: it raises no alarms.
     table : callable, optional
         Given the store, returns how to look at the table in force; None: it is not watched.
     live : LiveFeed, optional

@@ -29,7 +29,7 @@ from abbe.service.verification.verified_by import STRANGE_TABLE as STRANGE_TABLE
 
 @dataclass(frozen=True, slots=True)
 class InForce:
-    """The table in force at one time, and what the journal expects.
+    """The table in force at one time, and the table that the journal expects.
 
     Parameters
     ----------
@@ -141,7 +141,7 @@ class TableWatch:
         return in_force if in_force.settled else None
 
     def _problem(self, in_force: InForce) -> str:
-        """Return what is wrong with the table in force; empty: nothing."""
+        """Return the fault of the table in force; empty without a fault."""
         wanted = in_force.wanted if in_force.wanted is not None else self._first
         here = f"bank {in_force.bank} has CRC {in_force.crc:08X}"
         whose = f"that of {in_force.unverified}, which was never verified" if in_force.unverified else ""

@@ -61,7 +61,7 @@ FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 
 @dataclass(kw_only=True)
 class DemoRun:
-    """What every demonstration has: its machine, and the folder for database and machine file."""
+    """Common parts of a demonstration: its machine, and the folder for database and machine file."""
 
     site: Site
     folder: Path

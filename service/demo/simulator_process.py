@@ -36,7 +36,7 @@ class SimulatorError(AbbeError):
 
 @dataclass(frozen=True, slots=True)
 class SimulatorProcess:
-    """A running simulated machine; ``artefact``: what the plate on its table is stated to be."""
+    """A running simulated machine; ``artefact``: description of the plate on its table."""
 
     machine: Machine
     urls: DeviceUrls

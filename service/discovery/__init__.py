@@ -1,1 +1,1 @@
-"""Where simulation and measurement disagree, which effect is missing, and which measurement would show more."""
+"""Discovery: differences of simulation and measurement, the missing effect, and the measurement that would show more."""

@@ -1,4 +1,4 @@
-"""Campaigns of artefacts: what moves with the part, what stays with the machine, and which pose would tell what these do not."""
+"""Campaigns of artefacts: errors that move with the part, errors of the machine, and the pose that would separate the rest."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ class ArtefactFinding:
 
     @property
     def verdict(self) -> str:
-        """What moves with the part, what stays with the machine, what these poses cannot tell."""
+        """Verdict: errors that move with the part, errors of the machine, and errors that these poses do not separate."""
         if self.rank is None:
             return "unknown: part and machine are told apart by name for one plate in a plane only; the solution still does it by points"
         said = [

@@ -174,7 +174,7 @@ def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence
 
 
 def _record(since: int, changed: Changed, beside: tuple[str, ...]) -> ChangedSince:
-    """Convert the changes to what is stored with a finding: µm/m and µrad for linear parts, µm or µrad for shapes."""
+    """Convert the changes to their stored form in a finding: µm/m and µrad for linear parts, µm or µrad for shapes."""
     gap = None
     if changed.before_mm is not None and changed.after_mm is not None:
         gap = GapUm(before_um=changed.before_mm * 1e3, after_um=changed.after_mm * 1e3, floor_um=changed.floor_mm * 1e3)

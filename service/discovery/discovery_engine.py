@@ -1,4 +1,4 @@
-"""The search for what a model lacks, with its progress."""
+"""The search for missing effects, with its progress."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from abbe.service.effects.axis_test import is_axis_test
 
 
 def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
-    """Find what a case's present model lacks (`abbe.models.discovery.discover`), and report progress and remaining time to ``sink``.
+    """Find effects that a case's model lacks (`abbe.models.discovery.discover`), and report progress and remaining time to ``sink``.
 
     A positioning test of one axis is first searched for a drift of its repeats (`abbe.service.discovery.axis_search`).
     """

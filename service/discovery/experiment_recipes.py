@@ -37,7 +37,7 @@ TURNED = "a person has to turn the bar or change its ball in between"
 
 @dataclass(frozen=True)
 class NextPlan:
-    """What the machine measures next, and what a person has to do.
+    """Next measurement of the machine, and the tasks of the person.
 
     ``plan``: None if the sequencer can run none of it. ``by_hand``: additions that a person has to do, with the reason if the sequencer
     knows such a test but cannot run it here. ``after_s``: least age of the last reading at the start of the plan, s, for a late repeat.

@@ -1,4 +1,4 @@
-"""Campaigns of runs at standstill (ISO 230-3): what the temperatures explain of the displacement, in words and as JSON."""
+"""Campaigns of runs at standstill (ISO 230-3): the part of the displacement that temperatures explain, as text and JSON."""
 
 from __future__ import annotations
 

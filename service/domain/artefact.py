@@ -55,7 +55,7 @@ class CalibratedLength(FileObject):
 
 
 class ArtefactObject(FileObject):
-    """A plate, bar or workpiece with its features and what is known of it."""
+    """A plate, bar or workpiece with its features and known lengths."""
 
     kind: str
     features: list[Feature]
@@ -78,7 +78,7 @@ class ArtefactObject(FileObject):
 
 
 class ArtefactSetupObject(FileObject):
-    """Where the artefact lay, and what found its points."""
+    """Position of the artefact, and the sensor that found its points."""
 
     setup_id: str
     t_set_s: float

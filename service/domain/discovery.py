@@ -1,4 +1,4 @@
-"""A discovery, the search for what a campaign's model lacks: its start and the states that it reached."""
+"""A discovery, the search for effects that a campaign's model lacks: its start and the states that it reached."""
 
 from __future__ import annotations
 

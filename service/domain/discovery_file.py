@@ -49,7 +49,7 @@ class FoundBeside(FileObject):
 
 
 class FoundLocation(FileObject):
-    """Where, when and on what the missing effect depends; fields that are not known are left out."""
+    """Location, time and variables of the missing effect; unknown fields are left out."""
 
     tests: list[str] = Field(default_factory=list)
     axes: list[str] = Field(default_factory=list)
@@ -65,7 +65,7 @@ class FoundLocation(FileObject):
 
 
 class FoundTest(FileObject):
-    """What to measure next."""
+    """Next measurement."""
 
     adds: list[Adds]
     plan: dict[str, object] | None = None

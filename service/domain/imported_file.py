@@ -1,4 +1,4 @@
-"""What a campaign made of other programs' files holds beside its runs: where it comes from, readings that no run holds, stated figures."""
+"""Facts of a campaign made of other programs' files, beside its runs: origin, readings outside of runs, stated figures."""
 
 from __future__ import annotations
 

@@ -40,7 +40,7 @@ class JobState:
 
 @dataclass(frozen=True, slots=True)
 class JobOutcome:
-    """How a job ended: a word, a sentence, and the job's results in the store.
+    """End of a job: a word, a sentence, and the job's results in the store.
 
     ``word`` of a push or rollback: ``kept``: the new table is in force and verified; ``rolled back``: the old table is in force again;
     ``refused``, ``failed``, ``stopped`` (by a person): the new table was never in force; ``open``: it may be in force, unverified. Of a

@@ -85,14 +85,14 @@ class MachineObject(FileObject):
 
 
 class MeasuredFile(FileObject):
-    """What runs and campaigns state: whose readings they are."""
+    """Head of runs and campaigns: campaign and machine."""
 
     campaign: Name
     machine: MachineObject
 
 
 class RunFileHead(MeasuredFile):
-    """What every run states, of an instrument or of an artefact (``abbe-run/1``)."""
+    """Head of every run, of an instrument or of an artefact (``abbe-run/1``)."""
 
     format: Literal["abbe-run/1"]
     run_id: Name

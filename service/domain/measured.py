@@ -84,7 +84,7 @@ def arc_of(points_mm: F2 | Sequence[Sequence[float]]) -> F1:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunStart:
-    """What is known when a run begins.
+    """Facts known when a run begins.
 
     ``ctrl0_us``: zero of the campaign's clock in controller time; ``clock_us``: controller time when the document was written;
     ``path_start_us``: controller time at the start of the path, if known; ``standstills``: planned number of readings at standstill. A
@@ -154,7 +154,7 @@ class RunStart:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunEnd:
-    """What is known when a run ends; all None or empty without an end document.
+    """Facts known when a run ends; all None or empty without an end document.
 
     ``path_start_us``, ``path_end_us``: controller time of start and end of the path; ``good_us``: controller time until which an
     interrupted path ran at constant feed; ``box_boot_id``: boot id of the ball-bar's box; ``clock_pairs``: controller time (µs) and arrival
@@ -275,7 +275,7 @@ class MachineRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignHead:
-    """What is known when a campaign begins.
+    """Facts known when a campaign begins.
 
     ``ctrl0_us``: zero of its clock in controller time of the start ``boot_id``; None for an imported campaign, whose documents are
     ``imported`` and ``errors``.

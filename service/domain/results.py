@@ -40,7 +40,7 @@ class VerificationRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoveryRecord(DocumentRow):
-    """One search for what a campaign's model lacks. ``digest``: of readings, model and program, equal for equal searches."""
+    """One search for effects that a campaign's model lacks. ``digest``: of readings, model and program, equal for equal searches."""
 
     campaign_id: int
     digest: str

@@ -216,7 +216,7 @@ class BarSetup(Setup):
 
     @property
     def place_mm(self) -> F1:
-        """Where it stands: the centre of the sphere."""
+        """Position of the set-up: the centre of the sphere."""
         return self.centre_mm
 
 
@@ -241,7 +241,7 @@ class LaserSetup(Setup):
 
     @property
     def place_mm(self) -> F1:
-        """Where the machine mounts it: the start of the line; raises like `ends_mm`."""
+        """Position for mounting: the start of the line. Raises like `ends_mm`."""
         return self.ends_mm[0]
 
     @property
@@ -274,7 +274,7 @@ class Pose:
 
 @dataclass(frozen=True, kw_only=True, eq=False)
 class ArtefactSetup(Setup):
-    """Where an artefact lay.
+    """Position of an artefact.
 
     ``source``: what found its points. ``features``, ``cmm``: as the campaign states them (`Run.with_artefact`).
     """

@@ -49,7 +49,7 @@ class Signal:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmFacts:
-    """What an entry of an alarm states. A fact that its kind does not have keeps its default; ``text``: a sentence for people.
+    """Facts of an entry of an alarm. Facts that its kind lacks keep their defaults; ``text``: a sentence for people.
 
     Of a check: ``recipe``, ``schedule``, its number ``verification``, and its ``signals``. Of a person: ``name``, ``comment`` or
     ``reason``, and the end of a shelving, ``until_utc``. Of an investigation: its ``campaign``, its ``discovery``, what speaks ``against``

@@ -119,7 +119,7 @@ class OutlierFound(FileObject):
 
 
 class ResidualTestResult(FileObject):
-    """One test of one run's residuals; ``text``: what was found; empty if nothing."""
+    """One test of one run's residuals; ``text``: the finding, empty without one."""
 
     run: str
     test: str
@@ -183,7 +183,7 @@ class Uncertainty(FileObject):
 
 
 class VerdictValue(FileObject):
-    """Usability of the solution, what limits it, and what the layout of the campaign would allow."""
+    """Usability of the solution, its limits, and the best that the layout of the campaign allows."""
 
     word: Literal["good", "usable with care", "mostly assumption"]
     text: str

@@ -59,7 +59,7 @@ class Verification:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """What a check found. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
+    """Result of a check. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
 
     verdict: Verdict
     values: dict[str, float]

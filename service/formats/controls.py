@@ -1,4 +1,4 @@
-"""What controls can correct according to their manuals, and the best use of a control for an identified machine.
+"""Corrections that controls offer according to their manuals, and the best use of a control for an identified machine.
 
 `choices` evaluates each kind of table by the errors that remain over the whole volume in both directions of motion, after removal of the
 best-fit rigid motion and with the numbers rounded as in the control. If the control limits the number of tables, those with the largest
@@ -22,7 +22,7 @@ from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Latti
 
 @dataclass(frozen=True, slots=True)
 class ControlModel:
-    """What the tables of one control can hold.
+    """Capabilities of the tables of one control.
 
     Attributes
     ----------

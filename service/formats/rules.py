@@ -142,7 +142,7 @@ Evidence = Literal["verified by execution", "by manual"]
 
 @dataclass(frozen=True, slots=True)
 class SignRule:
-    """How a format writes an error as a number.
+    """Sign rule: the number that a format writes for an error.
 
     ``per_error``: factor of the error, +1 or −1. ``adds_position``: the nominal position is added. ``sure``: whether a manual states the
     sign explicitly; if not, verify the 10 µm step (docs/reference/formats.md) on the machine before loading a table.

@@ -1,4 +1,4 @@
-"""Solve a campaign: from runs to error parameters with uncertainty, and to what these runs cannot determine."""
+"""Solve a campaign: from runs to error parameters with uncertainty, and the parameters that these runs cannot determine."""
 
 from __future__ import annotations
 

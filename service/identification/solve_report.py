@@ -77,7 +77,7 @@ class Verdict:
 
 
 def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0, beside: str = "") -> Verdict:
-    """Judge what a solution can be used for.
+    """Judge the usability of a solution.
 
     The layout of the campaign limits the verdict. If the model does not fit, the larger uncertainty that was reached limits it further.
 
@@ -214,7 +214,7 @@ def _scale_free(found: Assessment) -> Assessment | None:
 
 
 def scale_text(found: Assessment) -> str:
-    """Return what is known without the scales that are the largest part of the uncertainty, as the end of a clause; empty if none are."""
+    """Return the uncertainty without the scales, as the end of a clause; empty unless scales are its largest part."""
     free = found.scale_free
     if free is None or free.left_out is None:
         return ""

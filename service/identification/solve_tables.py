@@ -77,7 +77,7 @@ def scale_free(found: Assessment) -> Assessment:
     Raises
     ------
     TableRefused
-        The scales are not what the runs know worst.
+        The scales are not the least certain part of the solution.
     """
     if found.scale_free is None:
         raise TableRefused("these runs determine the scales as well as the rest: leave nothing out", "run again without --without-scale")

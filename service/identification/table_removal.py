@@ -1,4 +1,4 @@
-"""Subtract what an active compensation table did beyond smooth corrections from a campaign's readings.
+"""Subtract the effect of an active compensation table beyond smooth corrections from a campaign's readings.
 
 The table is known exactly, from the controller or the database. Its moves of the axes suffer lost motion, and interpolation and rounding
 add to them: both effects are subtracted. The machine's lost motion is solved first, preferably without step diagonals, in which the table

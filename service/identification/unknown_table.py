@@ -60,7 +60,7 @@ def reading_patterns_mm(solution: JointSolution) -> F2:
 
 
 def effect_mm(data: tuple[RunData, ...], out: RemovedTable) -> F1:
-    """Return what a table did to the readings beyond smooth corrections, mm, run by run, shape (readings,)."""
+    """Return the effect of a table on the readings beyond smooth corrections, mm, run by run, shape (readings,)."""
     return np.concatenate([_on_run_mm(run, out.force) - _on_run_mm(run, out.stays) for run in data])
 
 

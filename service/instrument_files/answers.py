@@ -1,4 +1,4 @@
-"""What a file does not say: the questions that it leaves open, their answers, and what stays unknown and widens U."""
+"""Facts that a file does not state: questions, answers, and unknown facts that widen U."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ class Answers:
 
 @dataclass(frozen=True, slots=True)
 class Question:
-    """What has to be answered before a file can be used: the field of `Answers`, its text, and the possible answers (empty: a number)."""
+    """Question to answer before a file can be used: the field of `Answers`, its text, and the possible answers (empty: a number)."""
 
     key: str
     text: str

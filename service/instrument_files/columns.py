@@ -1,4 +1,4 @@
-"""Any table of readings (CSV, TSV, XLSX) with a file that says what its columns are, or with questions about them."""
+"""Any table of readings (CSV, TSV, XLSX) with a file that describes its columns, or with questions about them."""
 
 from __future__ import annotations
 
@@ -66,7 +66,7 @@ def toml_of(columns: ColumnFile) -> str:
 
 
 class ColumnFile(ColumnFilePart):
-    """What the columns of a table are (``abbe-columns/1``, TOML).
+    """Meaning of the columns of a table (``abbe-columns/1``, TOML).
 
     ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. Without ``target`` the axis stood at
     ``at_mm``, and ``time``, or ``every_s`` from row to row, says when it was read. ``temperatures``: further sensors by name. ``heading``:
@@ -215,7 +215,7 @@ def _text(cell: Any) -> str:
 
 @dataclass(frozen=True, slots=True)
 class _ReadingRows:
-    """The rows of readings of a table, its headings, and what its columns are."""
+    """The rows of readings of a table, its headings, and the meaning of its columns."""
 
     table: FileRows
     columns: ColumnFile
@@ -382,7 +382,7 @@ def _further(body: _ReadingRows) -> dict[str, F1]:
 
 
 def guesses(headings: Sequence[str]) -> Iterator[tuple[str, str]]:
-    """Which heading probably is which column of a `ColumnFile`, by common words."""
+    """Guess the heading of each column of a `ColumnFile` by common words."""
     words = {
         "target": r"target|nominal|position|pos|soll",
         "deviation": r"deviation|error|dev|fehler|abweichung",

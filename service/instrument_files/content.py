@@ -1,4 +1,4 @@
-"""What a file of an instrument holds, whatever its format; and how its bytes become lines."""
+"""Content of an instrument's file, independent of its format; and the decoding of its bytes into lines."""
 
 from __future__ import annotations
 
@@ -58,7 +58,7 @@ class Content:
     """Content of one file.
 
     ``name``: of the file, without its folder; ``said``: everything that it states, as text; ``machine``: name of the measured machine,
-    empty if not stated; ``notes``: what was not read or has to be known; ``unit_known``: False if the unit of ``test`` has to be asked.
+    empty if not stated; ``notes``: unread parts and remarks; ``unit_known``: False if the unit of ``test`` has to be asked.
     """
 
     name: str

@@ -207,7 +207,7 @@ def _run(one: PointList, campaign: str, label: str, machine: Doc, columns: Colum
 
 @dataclass(frozen=True)
 class KnownArtefact:
-    """What the files say of one artefact; ``features``: by name."""
+    """Facts of one artefact in the files; ``features``: by name."""
 
     kind: str
     features: Mapping[str, Doc]

@@ -1,4 +1,4 @@
-"""Which reader reads a file, by its ending; and what its import would store, as text for a person who decides."""
+"""Reader of a file by its ending; and a preview of its import as text, for the person who decides."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ URAD = 1e6
 
 
 def preview_rows(content: Content, test: AxisReadings | None, origin: SourceFile) -> list[tuple[str, str]]:
-    """Names and values of one file: what it is, what it states, its readings, what was not read and what is unknown."""
+    """Rows of a preview of one file: kind, stated facts, readings, unread parts, unknown facts."""
     out = [("file", content.name), ("format", content.form), ("machine", content.machine or "not stated")]
     if test is not None:
         out += _test_rows(test)

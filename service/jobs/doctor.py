@@ -42,7 +42,7 @@ class Examined:
 
 
 async def examine(loaded: LoadedMachine, now: datetime) -> AsyncIterator[Examined]:
-    """Yield what was examined, one thing after the other. Connects to every device, reads, and moves nothing.
+    """Yield the findings one by one. Connects to every device, reads, and moves nothing.
 
     Devices that another process is using are left alone.
     """

@@ -198,7 +198,7 @@ def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
 
 
 def promise_text(store: Store, made: StoredProposal) -> str:
-    """Return a proposal as a sentence: its promise with U (k = 2), its largest change, and what is not in the tables."""
+    """Return a proposal as a sentence: its promise with U (k = 2), its largest change, and errors that are not in the tables."""
     p = made.proposed.predicted
     gain, expanded = (p.before_mm - p.after_mm) * 1e3, 2e3 * p.u_model_mm
     left_out = "".join(f"; not in the tables: {line}" for line in made.proposed.not_for_tables)

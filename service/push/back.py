@@ -1,4 +1,4 @@
-"""Rollback to the table that was in force before the push, as a pure function of the journal and of what the controller reports.
+"""Rollback to the table that was in force before the push, as a pure function of the journal and of the state of the controller.
 
 The process that began the push runs it, or any later process. It may be interrupted anywhere, also by a crash, and run again.
 """
@@ -38,7 +38,7 @@ def record(state: PushState, **doc: object) -> Operation:
 
 
 def in_force(f: PushFacts, truth: Truth) -> str:
-    """Which table acts by the reported CRC: ``"base"`` (the old one), ``"candidate"`` (the new one), ``"neither"``; or ``"off"``: none."""
+    """Table in force by the reported CRC: ``"base"`` (the old one), ``"candidate"`` (the new one), ``"neither"``; or ``"off"``: none."""
     if truth.states[truth.active] is BankState.OFF:
         return "off"
     crc = truth.crc[truth.active]
@@ -48,7 +48,7 @@ def in_force(f: PushFacts, truth: Truth) -> str:
 
 
 def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
-    """Return what the journal expects and what the controller reports, for a person to compare."""
+    """Return the state that the journal expects and the state that the controller reports, for a person to compare."""
     reported = {"boot": truth.boot, "gen": truth.gen, "active": truth.active, "crc": list(truth.crc), "states": list(truth.states)}
     return {"expected": {"base_crc": f.base_crc, "crc": f.crc}, "controller": reported}
 

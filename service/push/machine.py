@@ -1,4 +1,4 @@
-"""The push protocol: the next operation as a pure function of the journal and of what this process knows of the controller.
+"""The push protocol: the next operation as a pure function of the journal and of the process's knowledge of the controller.
 
 The same function is the crash recovery: a process that did not begin the push knows nothing about it, so it activates no new table and
 rolls back an unverified one.

@@ -1,4 +1,4 @@
-"""Operations of the push machine, their outcomes, and what a process knows of the controller. Plain values, no I/O.
+"""Operations of the push machine, their outcomes, and the knowledge of a process about the controller. Plain values, no I/O.
 
 `stage` is the sequence that push and rollback share: it writes an image into the inactive bank chunk by chunk, seals it, and reads it back
 twice in full.
@@ -70,7 +70,7 @@ class Operation:
 
 @dataclass(frozen=True, slots=True)
 class Truth:
-    """What the controller reports in one coherent look.
+    """State of the controller from one coherent read.
 
     ``crc``: of both banks, 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty if no interlock is open and
     nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
@@ -136,7 +136,7 @@ Outcome = Done | OperationRefused | Doubt
 
 
 class PushKnowledge(NamedTuple):
-    """What a process has learned since its start or since the last journal entry; a crash loses all of it.
+    """Knowledge of a process since its start or the last journal entry; a crash loses all of it.
 
     A process that did not begin the push (``mine`` false) knows nothing, and this alone makes the push machine recover. It is a plain tuple
     for speed: the tests of all faults create millions of them.

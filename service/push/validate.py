@@ -67,7 +67,7 @@ class TableEvidence:
 
 @dataclass(frozen=True, slots=True)
 class EvidenceSeal:
-    """Who vouches for the table: role, and SHA-256 of the signed content; both are empty without a signature."""
+    """Person who vouches for the table: role, and SHA-256 of the signed content; both are empty without a signature."""
 
     role: str = ""
     digest: str = ""
@@ -90,7 +90,7 @@ class Candidate:
 
 @dataclass(frozen=True, slots=True)
 class CandidateContext:
-    """What a candidate is checked against: this machine, its controller, the table in force, the time.
+    """Reference for checks of a candidate: this machine, its controller, the table in force, the time.
 
     Parameters
     ----------

@@ -42,7 +42,7 @@ class FleetFigure:
 
 @dataclass(frozen=True, slots=True)
 class MachineStatus:
-    """Status of one machine: what its service does, and what its last check found. An empty text: there is none.
+    """Status of one machine: state of its service, and result of its last check. Empty text: there is none.
 
     Parameters
     ----------
@@ -144,7 +144,7 @@ def _status(
 
 
 def state_of(heartbeat: HeartbeatRecord | None, now: datetime) -> str:
-    """Return what a machine's service does, as far as its last heartbeat shows."""
+    """Return the state of a machine's service by its last heartbeat."""
     if heartbeat is None:
         return NO_SERVICE
     if heartbeat.owner.is_gone() or now - datetime.fromisoformat(heartbeat.seen_utc) > SILENT_AFTER:

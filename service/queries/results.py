@@ -32,7 +32,7 @@ class SolutionSummary(StoredResult):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SolutionDetail(SolutionSummary):
-    """A solution with every parameter, its standard uncertainty, and what the runs could not show (``not_observable``)."""
+    """A solution with every parameter, its standard uncertainty, and the errors that the runs could not show (``not_observable``)."""
 
     document: SolutionFile
 

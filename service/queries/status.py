@@ -125,7 +125,7 @@ class CoreState(Protocol):
 
     @property
     def attention(self) -> list[str]:
-        """What needs a person now."""
+        """Reason why a person is needed now."""
         ...
 
 

@@ -107,7 +107,7 @@ class Document:
     """A report. Mappings hold names and values as text, in printed order.
 
     ``verdict``: sign, word and sentence; ``remarks``: important notes at the top; ``sections``: main results, printed before the figures;
-    ``not_observable``: what this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
+    ``not_observable``: errors that this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
     figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper; ``days``: first and last day
     of the measurement (ISO 8601), None if not on record; ``issuer``, ``item``, ``issued``: laboratory, machine and day of a certificate.
     """

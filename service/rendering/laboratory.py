@@ -1,4 +1,4 @@
-"""A report as a calibration certificate on paper: what ISO/IEC 17025 (7.8.2, 7.8.4) wants beside the results, and what is missing."""
+"""A report as a calibration certificate on paper: facts that ISO/IEC 17025 (7.8.2, 7.8.4) requires beside the results, and missing ones."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def _what(document: Document, issuer: Issuer) -> dict[str, str]:
 
 
 def _missing(document: Document, issuer: Issuer) -> list[str]:
-    """What ISO/IEC 17025 wants and nobody has stated."""
+    """Facts that ISO/IEC 17025 requires and that are not stated."""
     item = document.item
     wanted = [
         (issuer.address, "address of the laboratory ([issuer] address)", "7.8.2.1 b"),

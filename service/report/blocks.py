@@ -33,7 +33,7 @@ class SummaryRow:
 
     @property
     def factor(self) -> float | None:
-        """How many times smaller the figure became."""
+        """Improvement factor of the figure."""
         return self.before / self.after if finite(self.before) and finite(self.after) and self.after != 0.0 else None
 
 

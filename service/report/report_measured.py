@@ -1,4 +1,4 @@
-"""Reports of what was measured: one run, or a campaign with its latest stored solution; also what an imported campaign holds beside its
+"""Reports of measurements: one run, or a campaign with its latest stored solution; also what an imported campaign holds beside its
 runs (angles, means of both directions, stated figures, what is unknown).
 """
 

@@ -18,7 +18,7 @@ MOST_LOST = 1e-3
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathReadings:
-    """What was read of a path before its interruption: its valid ``pieces``, and the readings that the rest is compared with.
+    """Readings of a path before its interruption: its valid ``pieces``, and the readings that the rest is compared with.
 
     ``arc_mm`` and ``deviation_mm``, shape (n,): position along the path and reading, mm; ``boot_id``: of the ball-bar's box.
     """

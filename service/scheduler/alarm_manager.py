@@ -49,7 +49,7 @@ WAITS = "waits"
 
 @dataclass(frozen=True, slots=True)
 class Duties:
-    """What the service does about alarms.
+    """Reactions of the service to alarms.
 
     Parameters
     ----------
@@ -96,7 +96,7 @@ class AlarmManager(RetryingStore):
         self._machine = machine
         self._schedules = tuple(schedules)
         self.duties = duties
-        """What the service does about alarms."""
+        """Reactions of the service to alarms."""
         self._channels = channels
         self._checked_again: set[tuple[int, int]] = set()
 

@@ -17,7 +17,7 @@ from abbe.service.domain.schedule import Schedule
 
 
 class Hindrance(NamedTuple):
-    """What keeps a slot from starting: the state that the slot gets if this lasts too long, and a sentence."""
+    """Obstacle to the start of a slot: the state of the slot if it lasts too long, and a sentence."""
 
     state: str
     text: str

@@ -1,4 +1,4 @@
-"""Protocols of what the scheduler needs from the rest of the service. Tests replace each with a few lines."""
+"""Protocols of the services that the scheduler needs. Tests replace each with a few lines."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ VERDICTS = ("pass", "fail", "cannot tell")
 
 @dataclass(frozen=True, slots=True)
 class Occasion:
-    """Which check of which machine this is."""
+    """Identity of a check: machine, schedule and slot."""
 
     machine: str
     schedule: Schedule

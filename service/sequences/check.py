@@ -1,4 +1,4 @@
-"""Dry run: what a plan will do, how long it takes, and whether it stays inside the machine - before anything moves."""
+"""Dry run of a plan: its motions, its duration, and whether it stays inside the machine - before anything moves."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What stops motion: requests of people (`Control`), and conditions in the status of the machine (interlocks).
+"""Reasons to stop motion: requests of people (`Control`), and conditions in the status of the machine (interlocks).
 
 A `Control` pauses, resumes, stops and aborts a measurement, and reports its state. Call it in the event loop of the measurement; from a
 signal handler or another thread use ``loop.call_soon_threadsafe``.
@@ -66,7 +66,7 @@ class Suspending:
 
 @dataclass(frozen=True, slots=True)
 class Watching:
-    """What the watcher checks, and how often. ``air_c``: allowed air temperature in degrees C, None: not watched.
+    """Conditions and rate of the watcher. ``air_c``: allowed air temperature in degrees C, None: not watched.
 
     ``unknown_s``: longest silence of the controller; ``air_unknown_s``: longest silence of the laser while only the air is watched.
     """
@@ -180,7 +180,7 @@ ABORTED = Aborted("aborted as asked: the axes were stopped where they were", "lo
 
 
 class State(StrEnum):
-    """What a measurement is doing."""
+    """State of a measurement."""
 
     READY = "ready"
     RUNNING = "running"

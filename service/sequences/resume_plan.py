@@ -1,4 +1,4 @@
-"""Where an interrupted test resumes, and how the machine gets there. Only computes; no device is used.
+"""Point at which an interrupted test resumes, and the way there. Only computes; no device is used.
 
 A bar must not move through its sphere, nor a mirror out of its beam: the machine returns the way the test came, to the last checkpoint. A
 ball-bar path resumes where it was interrupted, or begins again. A laser run resumes after its last complete point, once that point has
@@ -54,7 +54,7 @@ AROUND_MM = 100.0
 
 
 class PathProgress:
-    """How far a path has come at constant feed, from the controller's statuses; an interrupted run stores `doc`."""
+    """Progress of a path at constant feed, from the controller's statuses; an interrupted run stores `doc`."""
 
     def __init__(self, step: RecordPath) -> None:
         self._points, self._arc = np.asarray(step.points_mm, dtype=np.float64), arc_of(step.points_mm)
@@ -237,7 +237,7 @@ REFERENCE_MM = 0.003
 
 @dataclass(frozen=True, slots=True)
 class ResumeTrail:
-    """How to resume: along ``trail`` (oldest point first) back to number ``to``, then forward to number ``upto``.
+    """Way of resuming: along ``trail`` (oldest point first) back to number ``to``, then forward to number ``upto``.
 
     With ``carried`` records the last one is read again at ``upto``. On the way forward every axis moves as before, so that its lost motion
     is the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.

@@ -141,11 +141,11 @@ class TouchFeature:
         return x, y, z
 
     def before_mm(self, side: Point) -> Point:
-        """Where a touch of this side begins."""
+        """Start point of a touch of this side."""
         return self.at(side, self.radius_mm + (-self.search_mm if self.inside else self.search_mm))
 
     def beyond_mm(self, side: Point) -> Point:
-        """Where a touch of this side ends if nothing is there."""
+        """End point of a touch of this side without a contact."""
         return self.at(side, self.radius_mm + (self.search_mm if self.inside else -self.search_mm))
 
     def over_mm(self, side: Point) -> Point:

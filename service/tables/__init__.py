@@ -1,1 +1,1 @@
-"""Which compensation table is in force, how it came there, and what verified it. Writes nothing to a controller."""
+"""The compensation table in force, its history and its verification. Writes nothing to a controller."""

@@ -44,7 +44,7 @@ class TableOrigin:
 
 @dataclass(frozen=True, slots=True)
 class TableNames:
-    """How a message about a push calls its two tables: the new one in full and in short, and the old one."""
+    """Names of the two tables in messages about a push: the new one in full and in short, and the old one."""
 
     new: str = "the new table"
     it: str = "the new one"
@@ -262,7 +262,7 @@ class JournalView:
         crc, settled = self.wanted
         if crc is None or not settled:
             text = outcome_of(self._of(self.entries[-1].push)).text
-            raise TableRefused(f"which table is in force is not known: {text}", NOTHING)
+            raise TableRefused(f"the table in force is not known: {text}", NOTHING)
         last = self.last_kept()
         known = facts(last)
         if known.crc != crc:

@@ -23,7 +23,7 @@ NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
 
 @dataclass(frozen=True, slots=True)
 class AlarmTerms:
-    """Which checks to evaluate, and how: those of ``recipe`` after ``begins_utc``.
+    """Checks to evaluate (those of ``recipe`` after ``begins_utc``), and the terms.
 
     ``warn_days``: warn so many days ahead of the limit, 0 for never. ``compare``: figure -> value and standard uncertainty before the
     active alarm, so that the figures after a jump do not become its reference.
@@ -140,7 +140,7 @@ def alarm_numbered(store: Store, machine: str, number: int) -> Alarm:
     """One alarm by its number; raises `NotStored` if it does not exist."""
     found = next((one for one in alarms_of(store, machine) if one.number == number), None)
     if found is None:
-        raise NotStored(f"{machine} has no alarm {number}", "abbe alarm list shows those there are")
+        raise NotStored(f"{machine} has no alarm {number}", "`abbe alarm list` shows the open ones")
     return found
 
 
@@ -169,7 +169,7 @@ def evaluate_alarm(store: Store, machine: str, recipe: str, records: Sequence[Ve
 
 
 def check_facts(check: AlarmCheck, recipe: str, schedule: str, verification: int) -> AlarmFacts:
-    """What the alarm line of a check states."""
+    """Facts of a check for its alarm line."""
     found = check.found
     return AlarmFacts(recipe=recipe, schedule=schedule, verification=verification, signals=found.signals, text=found.text)
 

@@ -49,10 +49,10 @@ class ScaleTemperature:
 
 @dataclass(frozen=True, slots=True)
 class Reduction:
-    """How a test is reduced.
+    """Reduction of a test to 20 °C.
 
     ``expansion``: None if it is not; ``workpiece``: of the workpieces, None without a coefficient; ``at``: temperature of the scales as
-    text; ``of_workpiece``: coefficient as text; ``text``: what was used, or why it is not reduced; ``notes``: on its temperature.
+    text; ``of_workpiece``: coefficient as text; ``text``: the values used, or why it is not reduced; ``notes``: on its temperature.
     """
 
     expansion: Strain | None
@@ -95,7 +95,7 @@ def scale_temperature(runs: Sequence[Run], axis: str, material: AxisMaterial | N
 
 
 def holds_at(runs: Sequence[Run], materials: Mapping[str, AxisMaterial]) -> str:
-    """At which temperature of the scales what these runs showed holds, e.g. ``"X 24.00 ± 0.40 °C"``; `UNKNOWN` if none is known."""
+    """Temperature of the scales at which the results of these runs hold, e.g. ``"X 24.00 ± 0.40 °C"``; `UNKNOWN` if none is known."""
     out = []
     for axis in AXES:
         at, bad = scale_temperature(runs, axis, materials.get(axis)), _out_of_bounds(runs, axis)
@@ -128,7 +128,7 @@ def _out_of_bounds(runs: Sequence[Run], axis: str) -> str:
 
 
 def _notes(runs: Sequence[Run], axis: str, at: ScaleTemperature | None, material: AxisMaterial | None) -> tuple[str, ...]:
-    """What a reader must know of a temperature that is not the sensors': sensors of some runs only, air that is far from it."""
+    """Remarks on a temperature that is not from the sensors: sensors of some runs only, air that is far from it."""
     out = []
     having = sum(1 for run in runs if _recorded(run, _column(axis)).size)
     if 0 < having < len(runs):

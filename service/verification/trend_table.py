@@ -79,7 +79,7 @@ class FigureChart:
 
     @property
     def told(self) -> FigureTrend:
-        """What the chart says after the latest check."""
+        """Trend by the chart after the latest check."""
         found, ahead = self.found, self.found.forecast
         since, certain = (None if k is None else self.at[k] for k in (found.since, found.found))
         return FigureTrend(
@@ -105,7 +105,7 @@ class FigureChart:
 
 
 def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureTrend]:
-    """What the charts of `charts` say after the latest check."""
+    """Trends by the charts of `charts` after the latest check."""
     return [one.told for one in charts(records, after_utc)]
 
 

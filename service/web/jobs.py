@@ -76,7 +76,7 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     @app.post("/api/v1/jobs/{job}/prompts/{prompt}/done", status_code=202, response_model=JobState, responses=ACCEPTED | REFUSALS)
     @needs(Permission.MEASURE)
     async def done(request: Request, job: Annotated[str, NUMBER], prompt: Annotated[int, PROMPT]) -> Response:
-        """Confirm that a person has done what a prompt of the job asks; then the machine moves. Refused (409) if another prompt is open."""
+        """Confirm that a person has carried out a prompt of the job; then the machine moves. Refused (409) if another prompt is open."""
         visit: Visit = request.state.visit
         visit.target = f"job {job}, prompt {prompt}"
         return answered(core, await core.confirm_prompt(job, prompt, visit.principal.name))

@@ -36,7 +36,7 @@ SCREENS = {
 
 
 def step_address(step: PathStep, to_do: bool = False) -> str:
-    """Address of a step; ``to_do``: of what the step asks for. Empty: nothing exists yet."""
+    """Address of a step; ``to_do``: of the task of the step. Empty: nothing exists yet."""
     if to_do and step.key in {"cause", "proposal", "proof"}:
         return "/new?" + urlencode({"recipe": step.recipe or IDENTIFICATION})
     if step.number is None or (step.key == "report" and step.state != "now"):
@@ -148,7 +148,7 @@ def _lengths(rows: Sequence[Sequence[str]], *at: int) -> list[list[str]]:
 
 
 def measured(value: float | None, key: str, expanded: float | None = None) -> tuple[str, str]:
-    """A figure and its U in the reader's unit, rounded together; dashes for what is not known."""
+    """A figure and its U in the reader's unit, rounded together; dashes for unknown values."""
     frame = current()
     unit = language.figure(frame.lang, key)[1]
     if value is None or not expanded:
@@ -188,7 +188,7 @@ def own_verdicts(check: Verification) -> dict[str, str]:
 
 
 def sentence(check: Verification) -> str:
-    """What a check says of the machine, in the reader's words; a verdict with another reason than its figures keeps its stored sentence."""
+    """Result of a check in the reader's language; a verdict with another reason than its figures keeps its stored sentence."""
     frame = current()
     if check.cause is not None:
         return f"{frame.translate('check.stopped')} {phrase(frame.lang, check.cause.what)}"

@@ -49,7 +49,7 @@ def strip_of(status: Status | None) -> Strip:
 
 
 def alarm_line(one: AlarmSummary) -> str:
-    """What raised or held an alarm, or what it was raised for, in the reader's words and units."""
+    """Signals that raised or held an alarm, or its figures, in the reader's language and units."""
     return "; ".join(_signal(signal) for signal in one.signals) or one.text
 
 

@@ -32,7 +32,7 @@ class Plate:
     thickness_mm: float = 25.0
 
     def document(self, u_length_mm: float) -> dict[str, object]:
-        """Return what its owner knows: nominal places, and one certified length between the first and the last feature of the first row."""
+        """Return the known facts: nominal places, and one certified length between the first and the last feature of the first row."""
         ends = [k for k, name in enumerate(self.ids) if name.endswith("1")]
         one, two = ends[0], ends[-1]
         true = self.nominal_mm + self.form_mm
@@ -63,7 +63,7 @@ def draw_plate(config: ArtefactConfig, seed: int) -> Plate:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How the plate lies: origin (3,) and axes (3, 3) in workpiece coordinates; drift (mm/s), bends in the plane (mm at 100 mm, (2, 3))."""
+    """Pose of the plate: origin (3,) and axes (3, 3) in workpiece coordinates; drift (mm/s), bends in the plane (mm at 100 mm, (2, 3))."""
 
     origin_mm: F
     matrix: F

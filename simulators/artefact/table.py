@@ -1,4 +1,4 @@
-"""What lies on the table: a plate that the probe in the spindle can touch, once the fixture has put both there."""
+"""Artefact on the table: a plate that the probe in the spindle can touch, once the fixture has mounted both."""
 
 from collections.abc import Callable
 from dataclasses import replace

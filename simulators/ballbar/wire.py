@@ -15,7 +15,7 @@ SENT, SUPPRESSED, CORRUPTED = "sent", "suppressed", "corrupted"
 
 
 class BoxLedger:
-    """What became of each sample: successive sample numbers of equal fate form a run (stream, first, last, fate); streams count from 0."""
+    """Fate of each sample: successive sample numbers of equal fate form a run (stream, first, last, fate); streams count from 0."""
 
     def __init__(self) -> None:
         self.runs: list[list[int | str]] = []

@@ -1,4 +1,4 @@
-"""What a bad line does to bytes and frames of the ball-bar's box: pure functions; random values come from the caller's generator."""
+"""Effects of a bad line on bytes and frames of the ball-bar's box: pure functions; random values come from the caller's generator."""
 
 import random
 import struct

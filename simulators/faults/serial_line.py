@@ -26,7 +26,7 @@ class Uart:
 
 
 def heard(data: bytes, sender: Uart, receiver: Uart) -> bytes:
-    """Return what the receiver reads of bytes sent without pauses; a character without a stop bit reads as 0, as under Linux."""
+    """Return the bytes that the receiver reads, sent without pauses; a character without a stop bit reads as 0, as under Linux."""
     if sender == receiver:
         return data
     line = _bits(data, sender.parity)

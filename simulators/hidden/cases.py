@@ -253,7 +253,7 @@ BEYOND = ["second_tool_length", "single_axis_laser", "angular_interferometer", "
 
 @dataclass(frozen=True)
 class Visibility:
-    """How visible an effect is: rms in µm; ``snr_*`` and ``left`` (n,) in standard deviations of one reading.
+    """Visibility of an effect: rms in µm; ``snr_*`` and ``left`` (n,) in standard deviations of one reading.
 
     All but ``raw_rms_um`` count only the part that the present model cannot absorb. ``share_touched``: share of readings that it touches.
     """

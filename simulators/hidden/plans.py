@@ -30,7 +30,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Machinery:
-    """What a plan needs to know of the machine: strokes (3,) mm, vertical axis, and direction of each axis' last motion (``rest``, +-1)."""
+    """Facts of the machine for a plan: strokes (3,) mm, vertical axis, and direction of each axis' last motion (``rest``, +-1)."""
 
     low_mm: F
     high_mm: F

@@ -1,4 +1,4 @@
-"""What changes with time: thermal drift of the machine, and the air in which the laser measures."""
+"""Changes with time: thermal drift of the machine, and the air in which the laser measures."""
 
 from dataclasses import dataclass
 

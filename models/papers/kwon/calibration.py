@@ -284,7 +284,7 @@ class KwonCalibration:
 
     @property
     def statement(self) -> str:
-        """What the uncertainties rest on, as text."""
+        """Basis of the uncertainties, as text."""
         return "; ".join([*self._identified(), *self._warnings(), "every stated uncertainty is conditional on the prior"])
 
     def _identified(self) -> list[str]:

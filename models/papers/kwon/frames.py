@@ -39,7 +39,7 @@ class PositionErrors:
     three_point_rms_mm, best_fit_rms_mm : float
         Root mean square of the error vectors' lengths.
     datum : str
-        Note on what the three-point errors cannot show.
+        Note on the errors that the three-point frame cannot show.
     """
 
     three_point_mm: F2

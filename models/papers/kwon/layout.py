@@ -227,7 +227,7 @@ class Layout:
 
     @property
     def plane_text(self) -> str:
-        """Statement of where the points lie; for one plane also of what is unknown."""
+        """Statement of the region of the points; for one plane also of the unknown coefficients."""
         at = self.planes
         if at is None:
             return f"points between Z = {self.low_mm[2]:.6g} and {self.high_mm[2]:.6g} mm"

@@ -1,4 +1,4 @@
-"""How far two volumetric models differ over the working volume, with the confidence interval of the mean (Yang and Kim 2.2, Table 1).
+"""Difference of two volumetric models over the working volume, with the confidence interval of the mean (Yang and Kim 2.2, Table 1).
 
 The paper draws 100 random points, takes mean and standard deviation, and repeats that 100 times; its interval is x ± t s / sqrt(N) with
 N = 10 000. Its text names Student's t, but its figures result from 1.96 of the normal distribution; both are available by name. The mean of

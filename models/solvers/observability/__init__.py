@@ -1,1 +1,1 @@
-"""What a set of readings determines, what it leaves hidden, and which additional measurements would show it."""
+"""Combinations of errors that a set of readings determines, those that it hides, and measurements that would show them."""

@@ -77,7 +77,7 @@ class Present:
 
     @property
     def diagonals(self) -> int:
-        """How many of the four body diagonals were stepped."""
+        """Number of the four body diagonals that were stepped."""
         return len({name for name, _ in self.stepped})
 
 
@@ -335,7 +335,7 @@ class CureTrial:
     observed: F2
 
     def shows(self, combinations: F2) -> int:
-        """How many of these hidden combinations the addition makes visible; columns (k, m) of orthonormal coordinates."""
+        """Number of these hidden combinations that the addition makes visible; columns (k, m) of orthonormal coordinates."""
         return count_observed(self.observed @ combinations)
 
 

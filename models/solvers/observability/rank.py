@@ -89,7 +89,7 @@ def _resting(axes_mm: F2) -> F2:
 
 @dataclass(frozen=True)
 class Knowledge:
-    """What is known about the set-up besides the readings, for the rank only.
+    """Known facts of the set-up besides the readings, for the rank only.
 
     Attributes
     ----------
@@ -119,7 +119,7 @@ class CampaignColumns:
 
 @dataclass(frozen=True)
 class ObservedInformation:
-    """What the readings show of the machine.
+    """Information of the readings about the machine.
 
     Attributes
     ----------
@@ -132,7 +132,7 @@ class ObservedInformation:
     singular : array, shape (p,)
         Singular values of the design with unit columns, set-up projected out.
     row_space, null_space : array, shape (p, rank) and (p, p - rank)
-        Orthonormal combinations (unit columns) that the readings show; that leave no trace.
+        Orthonormal combinations (unit columns) that the readings show, and those that leave no trace.
     """
 
     rank: int

@@ -1,4 +1,4 @@
-"""`abbe alarm`, `abbe fleet`, `abbe trend`: what the scheduled checks of one machine or of all have found."""
+"""`abbe alarm`, `abbe fleet`, `abbe trend`: results of the scheduled checks of one machine or of all."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ def list_alarms(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """List alarms with their figures, and what the service did about each: campaign, finding, proposal, push."""
+    """List alarms with their figures and the reactions of the service: campaign, finding, proposal, push."""
     from abbe.service.config import load_machine
     from abbe.service.queries.reader import json_value
     from abbe.service.queries.status import alarms

@@ -171,7 +171,7 @@ def _opcua(loaded: LoadedMachine) -> OpcUa | None:
 def duties_on(
     alarm: AlarmSection, site: Site, plan: CampaignPlan, rate_hz: int = 100, live: LiveFeed | None = None
 ) -> Callable[[Store], Duties]:
-    """Return a function that takes the service's store and returns what the service does about alarms.
+    """Return a function that takes the service's store and returns its reactions to alarms.
 
     ``plan``: the full campaign; ``rate_hz``: ball-bar rate of verifications; ``live``: gets the samples of the campaign's paths.
     """

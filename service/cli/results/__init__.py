@@ -1,1 +1,1 @@
-"""Commands that solve, search, show and report what was measured."""
+"""Commands that solve, search, show and report measurements."""

@@ -41,7 +41,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 
     Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
     only if --db or -m names a database. After Ctrl-C the same command resumes. Runs at standstill with temperatures show the thermal
-    response instead (ISO 230-3), points of artefacts what moves with the part and what stays with the machine; neither is stored.
+    response instead (ISO 230-3), points of artefacts the errors that move with the part and those of the machine; neither is stored.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc

@@ -56,7 +56,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, what was not observable, signatures.
+    """Write a report: figures with U by ISO 230-2, -4, -6, conditions, certificates, decision, unobservable errors, signatures.
 
     The machine file gives database, limits, certificates, allowed temperature, and the expansion with which ISO 230-2 and 230-6 are
     reduced to 20 °C. Nothing is measured or computed again; the same data give the same bytes. A digital calibration certificate (.xml)

@@ -89,7 +89,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     ] = False,
     details: Annotated[bool, typer.Option("--details", help="Also print all parameters, comparisons, noise, and what is missing.")] = False,
 ) -> None:
-    """Solve a campaign: parameters with uncertainty, and what these runs cannot tell. The result is stored; nothing is pushed.
+    """Solve a campaign: parameters with uncertainty, and those that these runs do not determine. The result is stored; nothing is pushed.
 
     A folder's result is stored only if --db or -m names a database; tables that only this database holds then count, too. A run that
     contradicts its description is refused (exit code 2).
@@ -209,7 +209,7 @@ def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tup
             instruments=campaign.doc.get("instruments"),
             progress=report_stage,
         )
-        report_stage("what these runs cannot tell, and how well the volume is known")
+        report_stage("errors that these runs do not determine, and the uncertainty in the volume")
         summary = assess(solved, unknown_table=bool(known.not_removed))
         solution = solution_of(summary).model_copy(update=_more(summary, wanted, report_stage))
         doc = {"campaign": campaign.name, "machine": campaign.site.doc} | as_doc(solution) | known.doc

@@ -1,4 +1,4 @@
-"""What `abbe solve` says: the verdict first, in ten lines; parameters, comparisons, noise and limits of the runs in the details."""
+"""Output of `abbe solve`: the verdict first, in ten lines; parameters, comparisons, noise and limits of the runs in the details."""
 
 from __future__ import annotations
 

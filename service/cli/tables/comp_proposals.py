@@ -148,7 +148,7 @@ def diff(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show what a proposal changes: each of the nine tables in numbers, and as a picture."""
+    """Show the changes of a proposal: each of the nine tables in numbers, and as a picture."""
     from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
     from abbe.service.compensation.proposal_doc import load
     from abbe.service.queries.reader import json_value

@@ -19,7 +19,7 @@ SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 
 @dataclass(frozen=True, slots=True)
 class News:
-    """What came between two pictures of the machine, oldest first."""
+    """Events between two snapshots of the machine, oldest first."""
 
     checks: tuple[Verification, ...]
     alarms: tuple[PlantAlarm, ...]

@@ -198,7 +198,7 @@ class Space:
         return len(changed)
 
     async def _show_program(self, picture: Picture, now: datetime) -> None:
-        """A running check is the machine's active program; what the machine runs otherwise is not known."""
+        """A running check is the machine's active program; other programs of the machine are not known."""
         running, (state, at, name) = picture["Check/Active"].value, RUNNING
         recipe = picture["Check/Recipe"]
         await self._server.write_attribute_value(self._companion[name].nodeid, _data(recipe, now))

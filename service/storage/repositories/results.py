@@ -147,11 +147,11 @@ class Verifications(Repository):
         return self._all(VERIFICATION, *if_given(verifications.c.machine_id, machine_id), newest=True, limit=limit)
 
     def of_machine(self, machine: str, limit: int = 100) -> list[VerificationRecord]:
-        """List the latest checks of a machine by name, newest first, over all its descriptions."""
+        """List the latest checks of a machine by its name, newest first, including checks under earlier machine files."""
         return self._all(VERIFICATION, verifications.c.machine_id.in_(_descriptions(machine)), newest=True, limit=limit)
 
     def counts(self, machine: str) -> dict[str, int]:
-        """How many checks of a machine ended with each verdict, over its whole history."""
+        """Number of checks of a machine by verdict, over its whole history."""
         query = select(verifications.c.verdict, func.count()).where(verifications.c.machine_id.in_(_descriptions(machine)))
         rows = self._db.read(lambda connection: connection.execute(query.group_by(verifications.c.verdict)).all())
         return {str(verdict): int(count) for verdict, count in rows}
@@ -162,7 +162,7 @@ def _descriptions(machine: str) -> Any:
 
 
 class Discoveries(Repository):
-    """Searches for what a campaign's model lacks."""
+    """Searches for effects that a campaign's model lacks."""
 
     def add(self, campaign_id: int, digest: str, doc: Doc) -> int:
         """Open a discovery of a campaign; return its id. ``digest``: of readings, model and program; ``doc``: its start (`SearchBase`)."""

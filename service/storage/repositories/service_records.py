@@ -56,7 +56,7 @@ class Outbox(Repository):
         self._db.commit(lambda connection: queue_message(connection, topic, doc, self._db.now()))
 
     def count(self) -> int:
-        """How many messages wait for the broker."""
+        """Number of messages that wait for the broker."""
         query = select(func.count()).select_from(outbox).where(outbox.c.sent_utc.is_(None))
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))
 

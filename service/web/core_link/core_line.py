@@ -162,7 +162,7 @@ class CoreLine:
         return await self._ask(SteerJob(request=number, job=job, how=how, who=who))
 
     async def confirm_prompt(self, job: str, prompt: int, who: str) -> Answer:
-        """Confirm that a person has done what a prompt of a job asks. Raises CoreSilent if no answer comes."""
+        """Confirm that a person has carried out a prompt of a job. Raises CoreSilent if no answer comes."""
         return await self._ask(ConfirmPrompt(request=next(self._numbers), job=job, prompt=prompt, who=who))
 
     async def roll_back(self, push: int, crc: int, reason: str, key: str, who: str) -> Answer:

@@ -20,7 +20,7 @@ COOKIE = "abbe"
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """How visitors reach the service.
+    """Address by which visitors reach the service.
 
     Parameters
     ----------

@@ -70,7 +70,7 @@ def _order(one: AlarmSummary, shelved: bool) -> tuple[bool, int, int, int]:
 
 
 async def _changed(request: Request, context: PageContext, work: Callable[[int, str, dict[str, str]], object]) -> Response:
-    """Do what a form asks with an alarm, and show the alarm; a refusal gives the reason."""
+    """Apply a form to an alarm, and show the alarm; a refusal gives the reason."""
     visit: Visit = request.state.visit
     form = {key: value.replace("\0", "\ufffd")[:LONGEST_TEXT] for key, value in (await form_of(request) or {}).items()}
     try:

@@ -97,7 +97,7 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
 
 
 def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
-    """What the script draws: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970."""
+    """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970."""
     frame = current()
     name, unit = language.figure(frame.lang, chart.figure)
     points = sorted(points, key=lambda point: point.at)

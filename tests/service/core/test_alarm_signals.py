@@ -284,7 +284,7 @@ async def test_the_commands(tmp_path: Path, capsys: pytest.CaptureFixture[str]) 
     assert run(["alarm", "acknowledge", "-m", str(machine), "1"]) == 2
     assert "was acknowledged by otto" in capsys.readouterr().err
     assert run(["alarm", "acknowledge", "-m", str(machine), "9"]) == 2
-    assert "mill-7 has no alarm 9 - abbe alarm list shows those there are" in capsys.readouterr().err
+    assert "mill-7 has no alarm 9 - `abbe alarm list` shows the open ones" in capsys.readouterr().err
     assert run(["alarm", "list", "-m", str(machine), "--json"]) == 0
     (doc,) = json.loads(capsys.readouterr().out)["alarms"]
     assert (doc["alarm"], doc["state"], doc["signals"][0]["expanded"]) == (1, "acknowledged", 1.0)

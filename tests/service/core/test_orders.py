@@ -165,7 +165,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
         assert (answer.outcome, "another table has come into force meanwhile" in answer.text) == ("conflict", True)
     await bench.push({}, NEW, OTHER, UP_TO_ACTIVE)
     answer = await bench.ask(push=2)
-    assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "which table is in force is not known")
+    assert (answer.outcome, answer.text.split(":")[0]) == ("conflict", "the table in force is not known")
     assert JournalView.read(bench.store, MACHINE).history().now.crc is None
     assert (bench.orders_seen, bench.book.latest(), bench.recorded()) == ([], (), [])
 
