@@ -16,8 +16,8 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationErr
 from abbe.drivers.errors import BadDeviceFile
 
 FORMAT = "abbe-device/1"
-SHIPPED = Path(__file__).with_name("described") / "files"
-"""Folder of the shipped device files."""
+BUILTIN = Path(__file__).with_name("described") / "files"
+"""Folder of the built-in device files."""
 Kind = Literal["displacement", "position", "temperature"]
 Type = Literal["u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 SIZE: dict[Type, int] = {"u16": 1, "i16": 1, "u32": 2, "i32": 2, "f32": 2, "u64": 4, "i64": 4, "f64": 4}
@@ -244,7 +244,7 @@ def port_settings(file: DeviceFile) -> dict[str, Any]:
 
 def find(name: str) -> Path:
     """Return the path of a device file. A name without dot and slash means the built-in file ``name.toml``."""
-    return Path(name) if "." in name or "/" in name else SHIPPED / f"{name}.toml"
+    return Path(name) if "." in name or "/" in name else BUILTIN / f"{name}.toml"
 
 
 def load(name: str) -> tuple[DeviceFile, str]:
@@ -260,7 +260,7 @@ def load(name: str) -> tuple[DeviceFile, str]:
         data = path.read_bytes()
         doc = tomllib.loads(data.decode("utf-8"))
     except FileNotFoundError:
-        known = ", ".join(sorted(p.stem for p in SHIPPED.glob("*.toml")))
+        known = ", ".join(sorted(p.stem for p in BUILTIN.glob("*.toml")))
         raise BadDeviceFile(str(path), "read device file", "it does not exist", f"give a path, or one of {known}") from None
     except (OSError, ValueError, RecursionError) as error:
         raise BadDeviceFile(str(path), "read device file", f"{error}", "give a readable TOML file in UTF-8") from None

@@ -64,10 +64,10 @@ class OpcUaControl(ListenedControl):
                 raise WrongDevice(self.name, "identify", f"the position of {axis.upper()} states no unit", "add unit=mm to its URL")
             return self._unit
         node = await self._ask("identify", self._nodes[axis].get_child(names["EngineeringUnits"]))
-        told = (await self._ask("identify", node.read_value())).UnitId
-        found = UNECE.get(told, "")
+        unit_id = (await self._ask("identify", node.read_value())).UnitId
+        found = UNECE.get(unit_id, "")
         if not found or (self._unit and found != self._unit):
-            what = found or f"of unit {told}, which is no length known here"
+            what = found or f"of unit {unit_id}, which is no length known here"
             raise WrongDevice(self.name, "identify", f"the position of {axis.upper()} is in {what}; stated is {self._unit or 'nothing'}")
         return found
 

@@ -420,7 +420,7 @@ class ChannelBroken(AbbeError):
     code = "SRV-001"
 
 
-class CoreSilent(AbbeError):
+class CoreUnavailable(AbbeError):
     """The service's core does not answer its web process. The page does not know what runs on the machine."""
 
     code = "SRV-002"

@@ -214,8 +214,8 @@ def beside(text: str, folder: Path) -> str:
     found = described_by(url)
     if not found or isinstance(url, FixtureTcpUrl | FixtureConsoleUrl):
         return text
-    shipped = "." not in found.device and "/" not in found.device
-    files = Description(found.device if shipped else str(folder / found.device), str(folder / found.tested) if found.tested else "")
+    builtin = "." not in found.device and "/" not in found.device
+    files = Description(found.device if builtin else str(folder / found.device), str(folder / found.tested) if found.tested else "")
     return str(replace(url, description=files))
 
 

@@ -48,7 +48,7 @@ def _left(problem: WhitenedProblem, effects: F2, sd: F1) -> F1:
         normal.append((a.T @ a, a.T @ white[at, 0]))
     gram, right = (np.sum(part, axis=0) for part in zip(*normal, strict=True))
     out = np.zeros(read.size)
-    for b, (own, told) in enumerate(normal):
-        x = root @ np.linalg.solve(gram - own + np.eye(len(root)), right - told)
+    for b, (own, own_right) in enumerate(normal):
+        x = root @ np.linalg.solve(gram - own + np.eye(len(root)), right - own_right)
         out[block == b] = (read - tangent.raw @ x[:p] - effects @ x[p:])[block == b]
     return out

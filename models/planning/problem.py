@@ -112,8 +112,8 @@ def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: 
 def factor(information: F2) -> F2:
     """Rows F with F^T F = information, without directions that hold less than 1e-5 of the prior's information, shape (r, size)."""
     value, vector = scipy.linalg.eigh(information, driver="evd")  # faster than a driver that finds only the needed eigenvalues
-    told = value > 1e-5
-    return np.asarray(np.sqrt(value[told])[:, None] * vector.T[told])
+    kept = value > 1e-5
+    return np.asarray(np.sqrt(value[kept])[:, None] * vector.T[kept])
 
 
 def field_rows(what: PlanningProblem, share: float, nodes: int) -> F2:

@@ -144,12 +144,12 @@ class PlanSearch:
         factors = [self._gain_factor(chosen.get(test.mounting, ()), test) for test in costs]
         ends = np.cumsum([len(f) for f in factors])
         known = scipy.linalg.solve_triangular(lower, np.concatenate([self._rows, *factors]).T, lower=True)  # all tests at once
-        half, told = known[:, : len(self._rows)], known[:, len(self._rows) :].T
-        start, seen = (half**2).sum(axis=0), told @ half
+        half, offered = known[:, : len(self._rows)], known[:, len(self._rows) :].T
+        start, seen = (half**2).sum(axis=0), offered @ half
         now, rates = self._judge(start), dict[Measurement, float]()
         for (test, cost), end, f in zip(costs.items(), ends, factors, strict=True):
             at = slice(end - len(f), end)
-            s = scipy.linalg.cholesky(np.eye(len(f)) + told[at] @ told[at].T, lower=True, check_finite=False)
+            s = scipy.linalg.cholesky(np.eye(len(f)) + offered[at] @ offered[at].T, lower=True, check_finite=False)
             reduction = scipy.linalg.solve_triangular(s, seen[at], lower=True, check_finite=False)
             rates[test] = (now - self._judge(start - (reduction**2).sum(axis=0))) / cost**thrift
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])

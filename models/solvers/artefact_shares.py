@@ -62,13 +62,13 @@ def _um(value_mm: float, u_mm: float) -> str:
 
 
 def shares_text(found: tuple[Share, ...], rank: PoseRank | None) -> str:
-    """Return one line on all fields, with the pose that would tell what is unknown; empty without any."""
+    """Return one line on all fields, with the pose that would show the unknown ones; empty without any."""
     if not found or rank is None:
         return ""
     line = f"At {found[0].reach_mm:.0f} mm from its centre: {'; '.join(s.text for s in found)}."
     lost = [s.field for s in found if s.verdict == "unknown"]
-    cure = next(((name, told) for name, _, told in rank.cures if set(told) & set(lost)), None)
-    return line + (f" A further pose {cure[0]} would tell: {', '.join(cure[1])}." if cure is not None else "")
+    cure = next(((name, fields) for name, _, fields in rank.cures if set(fields) & set(lost)), None)
+    return line + (f" A further pose {cure[0]} would show: {', '.join(cure[1])}." if cure is not None else "")
 
 
 def field_shares(joint: JointSolution, rank: PoseRank) -> tuple[Share, ...]:

@@ -16,9 +16,9 @@ device = typer.Typer(no_args_is_help=True, help="Test devices and interferometer
 @device.command("list")
 def list_files(as_json: JsonOption = False) -> None:
     """List the device files that come with Abbe; `device=NAME` in a URL uses one."""
-    from abbe.drivers.device_file import SHIPPED, load
+    from abbe.drivers.device_file import BUILTIN, load
 
-    found = [(path.stem, load(path.stem)[0]) for path in sorted(SHIPPED.glob("*.toml"))]
+    found = [(path.stem, load(path.stem)[0]) for path in sorted(BUILTIN.glob("*.toml"))]
     if as_json:
         print_json([{"name": name, "kind": file.kind, "device": file.name} for name, file in found])
         return

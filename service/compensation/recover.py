@@ -24,7 +24,7 @@ from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMisma
 from abbe.service.push import execute
 from abbe.service.push.execute import ControllerPort, no_actors
 from abbe.service.push.journal import NO_PUSH, Journal, StoreBook, facts
-from abbe.service.push.operations import Done, Doubt, Operation, OperationKind, Outcome, Truth
+from abbe.service.push.operations import Done, Operation, OperationKind, Outcome, Truth, Unanswered
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import operator_needed
@@ -346,7 +346,7 @@ def _blocked_by(look: Outcome) -> str:
     if isinstance(look, Done):
         return look.value.unsafe if isinstance(look.value, Truth) else "no answer"
     # The message of the link counts down: its text would differ, and notify, at every look.
-    return "the controller does not answer" if isinstance(look, Doubt) else look.text
+    return "the controller does not answer" if isinstance(look, Unanswered) else look.text
 
 
 def with_notes(error: BaseException) -> str:

@@ -141,7 +141,7 @@ def artefact_report(result: DemoResult) -> Document:
     before, after = (plain(t.plane_rms_um) for t in result.truths)
     rows.append(("sealed truth, rms in the plane", before, "", after, ""))
     table = TextTable(("figure, µm", "before", "U (95 %)", "after", "U (95 %)"), tuple(rows))
-    told = Section("Results of these poses", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
-    sections = (Section("Before and after", [c.decision.text, table]), *artefact_sections(c.solved.joint), told)
+    results = Section("Results of these poses", [Lines((*artefact_lines(c.solved.joint), *(flag.line for flag in c.solved.flags)))])
+    sections = (Section("Before and after", [c.decision.text, table]), *artefact_sections(c.solved.joint), results)
     title = f"Simulated machine {result.seed}, measured by its own probe"
     return Document(kind="cycle", title=title, sections=sections, signatures=())

@@ -33,7 +33,7 @@ class ArtefactFinding:
     def verdict(self) -> str:
         """Verdict: errors that move with the part, errors of the machine, and errors that these poses do not separate."""
         if self.rank is None:
-            return "unknown: part and machine are told apart by name for one plate in a plane only; the solution still does it by points"
+            return "unknown: named fields are separated for one plate in a plane only; the solution separates part and machine by points"
         said = [
             f"{where}: {', '.join(found)}"
             for where, words in (

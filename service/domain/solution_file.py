@@ -285,7 +285,8 @@ class SolutionFile(FileObject):
     rank: Rank
     rough: list[str] = Field(default_factory=list, description="which motions are rough, with length or period and remedy")
     artefacts: list[str] = Field(
-        default_factory=list, description="what the poses of an artefact hide and which would tell it; plain fit of each workpiece"
+        default_factory=list,
+        description="errors that the poses of an artefact hide, the pose that would show them; separate fit of each workpiece",
     )
     not_observable: list[str]
     advice: list[str]

@@ -36,8 +36,8 @@ def artefact_lines(joint: JointSolution) -> list[str]:
     """Return the errors that the poses of an artefact hide, the pose that would show them, their share of the named fields, and a separate
     fit of every workpiece."""
     rank = pose_rank(joint.data)
-    told = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
-    return told + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
+    poses = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
+    return poses + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
 
 
 def without_length(joint: JointSolution) -> bool:

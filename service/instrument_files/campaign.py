@@ -58,7 +58,7 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     """
     _check_together(contents)
     tests = [settled(content, answers) for content in contents]
-    traces = [_standing(content.trace, answers) for content in contents if content.trace is not None]
+    traces = [_standstill(content.trace, answers) for content in contents if content.trace is not None]
     linear = [test for test in tests if test is not None and _is_run(test)]
     measured = [(test.axis, test.position_mm) for test in tests if test is not None]
     measured += [(axis, columns[f"{axis.lower()}_mm"]) for columns, axis in traces]
@@ -106,8 +106,8 @@ def _check_together(contents: Sequence[Content]) -> None:
         seen[content.sha256] = content.name
     named = {content.machine: content.name for content in contents if content.machine}
     if len(named) > 1:
-        told = ", ".join(f"{machine!r} ({file})" for machine, file in named.items())
-        raise FileFormatError(f"the files name different machines: {told}", "import the files of each machine separately")
+        listing = ", ".join(f"{machine!r} ({file})" for machine, file in named.items())
+        raise FileFormatError(f"the files name different machines: {listing}", "import the files of each machine separately")
 
 
 def _is_run(test: AxisReadings) -> bool:
@@ -142,7 +142,7 @@ def _columns(test: AxisReadings) -> dict[str, F1]:
     }
 
 
-def _standing(trace: Trace, answers: Answers) -> tuple[dict[str, F1], str]:
+def _standstill(trace: Trace, answers: Answers) -> tuple[dict[str, F1], str]:
     """A trace of a standing axis as columns, averaged in blocks if it is long: displacement since its first sample."""
     axis = trace.axis or str(answers.axis)
     block = -(-trace.samples.size // MOST_SAMPLES)

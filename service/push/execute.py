@@ -1,7 +1,7 @@
 """Run the push machine: get the next operation, do it through a port, learn from its outcome. Tests run the same loop on a model.
 
 `ControllerPort` is the port to a real controller: it turns each operation into calls of the driver or a question to `PushActors`, and
-errors of the driver into outcomes: Refused (nothing changed) or Doubt (the result is unknown). It decides nothing.
+errors of the driver into outcomes: Refused (nothing changed) or Unanswered (the result is unknown). It decides nothing.
 """
 
 from __future__ import annotations
@@ -149,7 +149,7 @@ class ControllerPort:
         except Refused as error:
             return o.OperationRefused(str(error))
         except (DriverError, TimeoutError) as error:
-            return o.Doubt(str(error) or type(error).__name__)
+            return o.Unanswered(str(error) or type(error).__name__)
 
     async def _execute(self, op: Operation, journal: Journal) -> Outcome:
         match op.kind:

@@ -126,13 +126,13 @@ class OperationRefused:
 
 
 @dataclass(frozen=True, slots=True)
-class Doubt:
+class Unanswered:
     """No valid answer: the operation may have happened, or not, or still happen."""
 
     text: str
 
 
-Outcome = Done | OperationRefused | Doubt
+Outcome = Done | OperationRefused | Unanswered
 
 
 class PushKnowledge(NamedTuple):
@@ -167,7 +167,7 @@ class PushKnowledge(NamedTuple):
         late commands of the old owner.
     forgets : int
         Writes since the last entry that make a control discard a table that it laid aside.
-    verdict : Done, Refused or Doubt, optional
+    verdict : Done, Refused or Unanswered, optional
         Answer to the last question (validate, approve, probe, verify).
     unanswered : int
         Consecutive operations without a valid answer.
@@ -230,7 +230,7 @@ def after_record(known: PushKnowledge, state: PushState) -> PushKnowledge:
 
 def learn(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
     """Knowledge after the ``outcome`` of ``op``, which is neither RECORD nor END."""
-    known = known._replace(unanswered=known.unanswered + 1 if isinstance(outcome, Doubt) else 0)
+    known = known._replace(unanswered=known.unanswered + 1 if isinstance(outcome, Unanswered) else 0)
     if op.kind is OperationKind.LOOK:
         return _looked(known, op, outcome)
     if op.kind in (OperationKind.READ, OperationKind.READ_AGAIN):
@@ -252,7 +252,7 @@ def _looked(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowle
 
 
 def _read(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowledge:
-    if isinstance(outcome, Doubt):
+    if isinstance(outcome, Unanswered):
         return known
     done = isinstance(outcome, Done)
     if op.kind is OperationKind.READ:
@@ -267,10 +267,10 @@ def _chunk(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKnowled
         if isinstance(outcome, OperationRefused):
             return known._replace(verdict=outcome, wrote=True, truth=None)
         again = int(known.differs)
-        unsure = isinstance(outcome, Doubt)
+        unsure = isinstance(outcome, Unanswered)
         known = known._replace(rewrites=known.rewrites + again, rewrites_here=known.rewrites_here + again, truth=None)
         return known._replace(wrote=True, differs=False, unsure=unsure, written=known.written + (not unsure))
-    if isinstance(outcome, Doubt):
+    if isinstance(outcome, Unanswered):
         return known
     if isinstance(outcome, Done) and outcome.value == op.data:
         written = known.written + int(known.unsure)
@@ -285,7 +285,7 @@ def _commanded(known: PushKnowledge, op: Operation, outcome: Outcome) -> PushKno
         return known._replace(verdict=outcome, lease=lease, leases=known.leases + 1)
     if op.kind is OperationKind.RELEASE:  # a refusal means that another owner has it: the old owner is shut out either way
         known = known._replace(releases=known.releases + 1, stop=known.stop or op.text)
-        return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)
+        return known if isinstance(outcome, Unanswered) else known._replace(fenced=True, lease=0)
     if op.kind is OperationKind.SEAL:
         return known._replace(sealed=known.sealed + 1, verdict=outcome if isinstance(outcome, OperationRefused) else None)
     return known._replace(asked=True, verdict=outcome, backs=known.backs + int(op.text == BACK))

@@ -133,10 +133,10 @@ class _AlarmHistory:
         failed = alarm.last(AlarmKind.ENDED) is not None and proposal is None
         yield "alarm", "done" if alarm.acknowledged_by else "waiting", alarm.number, ""
         yield "check", "done", self._raising(alarm), ""
-        told = search is not None and search.state in SEARCHED
+        searched = search is not None and search.state in SEARCHED
         yield (
             "cause",
-            "done" if told or proposal is not None else "failed" if failed else later,
+            "done" if searched or proposal is not None else "failed" if failed else later,
             None if search is None else search.number,
             "",
         )
@@ -162,14 +162,14 @@ class _AlarmHistory:
         return next((e.facts.verification for e in self._entries if e.kind is AlarmKind.CLEARED), None)
 
     def _search(self, alarm: Alarm) -> DiscoverySummary | None:
-        told = alarm.last(AlarmKind.DISCOVERED)
+        entry = alarm.last(AlarmKind.DISCOVERED)
         found = discoveries(self._reader, None, self._reader.machine, None, LATEST)[0]
-        return _of_alarm(found, alarm, None if told is None else told.facts.discovery)
+        return _of_alarm(found, alarm, None if entry is None else entry.facts.discovery)
 
     def _proposal(self, alarm: Alarm) -> ProposalSummary | None:
-        told = alarm.last(AlarmKind.PROPOSED)
+        entry = alarm.last(AlarmKind.PROPOSED)
         found = proposals(self._reader, self._reader.machine, None, LATEST)[0]
-        return _of_alarm(found, alarm, None if told is None else told.facts.proposal)
+        return _of_alarm(found, alarm, None if entry is None else entry.facts.proposal)
 
     def _push(self, proposal: ProposalSummary | None) -> PushSummary | None:
         if proposal is None:

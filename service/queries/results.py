@@ -237,7 +237,7 @@ def trends(reader: Reader, machine: str, after_utc: datetime | None = None, limi
         return Trends(machine=machine)
     known = verified_by(reader.store, machine, control=reader.control_of(machine))
     found = charts(reader, machine, after_utc or known.since, limit)
-    return Trends(machine=machine, figures=[one.told for one in found], verified=known)
+    return Trends(machine=machine, figures=[one.as_trend for one in found], verified=known)
 
 
 def charts(reader: Reader, machine: str, after_utc: datetime | None, limit: int = CHECKS) -> list[FigureChart]:

@@ -96,7 +96,7 @@ class Status(Activity):
 
 
 class CoreState(Protocol):
-    """Current state of the core. Every property raises CoreSilent while the core does not answer."""
+    """Current state of the core. Every property raises CoreUnavailable while the core does not answer."""
 
     @property
     def devices(self) -> list[DeviceStatus]:

@@ -42,9 +42,9 @@ def _characteristic(figure: ReportFigure, number: int) -> Iterator[str]:
         yield f"K2111/{number} {figure.limit!r}"
     if figure.unit:
         yield f"K2142/{number} {figure.unit}"
-    told = f"U = {COVERAGE * figure.u!r} {figure.unit} (k = {tidy(COVERAGE)})" if finite(figure.u) else "U is not known"
+    uncertainty = f"U = {COVERAGE * figure.u!r} {figure.unit} (k = {tidy(COVERAGE)})" if finite(figure.u) else "U is not known"
     method = f"; {figure.method}" if figure.method else ""
-    yield f"K2900/{number} {_one_line(told + method)}"
+    yield f"K2900/{number} {_one_line(uncertainty + method)}"
 
 
 def _value(figure: ReportFigure, number: int, days: tuple[str, str] | None) -> Iterator[str]:

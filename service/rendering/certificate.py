@@ -148,10 +148,10 @@ def _result(document: Document) -> ET.Element:
         _tag("measuringEquipment", _text(document, "name", one.name), _text(document, "description", f"{one.certificate}; {one.known}"))
         for one in document.instruments
     ]
-    told = document.conditions or {"Conditions": "none on record"}
+    stated = document.conditions or {"Conditions": "none on record"}
     conditions = [
         _tag("influenceCondition", _text(document, "name", name), _tag("data", _text(document, "text", value)))
-        for name, value in told.items()
+        for name, value in stated.items()
     ]
     groups = [_group(document, name, list(figures)) for name, figures in groupby(document.figures, key=lambda one: one.group)]
     return _tag(

@@ -105,7 +105,7 @@ def _characteristics(figures: Sequence[ReportFigure], ids: Sequence[tuple[int, .
 
 def _results(document: Document, judged: Sequence[ReportFigure], ids: Sequence[tuple[int, ...]], number: int) -> ET.Element:
     others = [figure for figure in document.figures if figure.limit is None]
-    texts = [(f"{figure.group}: {figure.symbol}", _told(figure)) for figure in others] + list(document.conditions.items())
+    texts = [(f"{figure.group}: {figure.symbol}", _value_text(figure)) for figure in others] + list(document.conditions.items())
     parts = [_list("Attributes", [_tag("AttributeStr", name=" ".join(printable(name).split()), value=text) for name, text in texts])]
     if judged:
         measured = [_measurement(figure, own) for figure, own in zip(judged, ids, strict=True)]
@@ -130,7 +130,7 @@ def _decimal(value: float | None) -> str:
     return f"{value:.12f}".rstrip("0").rstrip(".")
 
 
-def _told(figure: ReportFigure) -> str:
+def _value_text(figure: ReportFigure) -> str:
     if not finite(figure.value):
         return "not observable"
     known = f"U = {_decimal(COVERAGE * figure.u)} {figure.unit} (k = {COVERAGE:g})" if finite(figure.u) else "U is not known"

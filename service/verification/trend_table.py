@@ -78,7 +78,7 @@ class FigureChart:
         return mean_of(self.values[:before], self.expanded[:before] / COVERAGE)[0]
 
     @property
-    def told(self) -> FigureTrend:
+    def as_trend(self) -> FigureTrend:
         """Trend by the chart after the latest check."""
         found, ahead = self.found, self.found.forecast
         since, certain = (None if k is None else self.at[k] for k in (found.since, found.found))
@@ -106,7 +106,7 @@ class FigureChart:
 
 def trends(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureTrend]:
     """Trends by the charts of `charts` after the latest check."""
-    return [one.told for one in charts(records, after_utc)]
+    return [one.as_trend for one in charts(records, after_utc)]
 
 
 def charts(records: Sequence[VerificationRecord], after_utc: datetime | None = None) -> list[FigureChart]:

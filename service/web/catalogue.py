@@ -46,7 +46,7 @@ STATUS: dict[type[AbbeError], int] = {
     errors.JournalChanged: 409,
     errors.StoreError: 503,
     errors.AuditBroken: 503,
-    errors.CoreSilent: 503,
+    errors.CoreUnavailable: 503,
     errors.KeyReused: 409,
     errors.KeyInUse: 409,
     errors.Unusable: 409,

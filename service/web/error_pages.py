@@ -15,7 +15,7 @@ from jinja2 import Environment
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.errors import AbbeError, CoreSilent
+from abbe.service.errors import AbbeError, CoreUnavailable
 from abbe.service.queries.status import Status
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current, frame_for
@@ -26,17 +26,17 @@ RETRY_S = "5"
 
 
 def add_core_unavailable(app: FastAPI, env: Environment) -> None:
-    """Install the handler of `CoreSilent` for every address."""
+    """Install the handler of `CoreUnavailable` for every address."""
 
     async def silent(request: Request, error: Exception) -> Response:
-        assert isinstance(error, CoreSilent)
+        assert isinstance(error, CoreUnavailable)
         if not for_people(request):
             return problem_of(error)
         return HTMLResponse(
             env.get_template("core_unavailable.html").render(text=str(error), bar=strip_of(None)), 503, {"Retry-After": RETRY_S}
         )
 
-    app.add_exception_handler(CoreSilent, silent)
+    app.add_exception_handler(CoreUnavailable, silent)
 
 
 def for_people(request: Request) -> bool:

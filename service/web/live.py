@@ -9,7 +9,7 @@ from contextlib import suppress
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from pydantic import TypeAdapter
 
-from abbe.service.errors import CoreSilent
+from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.status import LiveEvent
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
@@ -92,6 +92,6 @@ def _event(core: CoreLine, revision: int) -> str | None:
         event = LiveEvent(
             revision=revision, job=core.job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=core.attention
         )
-    except CoreSilent:
+    except CoreUnavailable:
         return None
     return _EVENT.dump_json(event).decode()

@@ -13,7 +13,7 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from abbe.service.channel.messages import Snapshot
-from abbe.service.errors import CoreSilent
+from abbe.service.errors import CoreUnavailable
 from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
@@ -31,7 +31,7 @@ class _MetricsCollector(Collector):
         yield from self._of_store()
         try:
             snapshot = self._core.snapshot()
-        except CoreSilent:
+        except CoreUnavailable:
             yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 0.0)
             return
         yield GaugeMetricFamily("abbe_core_up", "Whether the core process answers", 1.0)

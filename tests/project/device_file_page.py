@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from abbe.drivers.device_file import FORMAT, NEEDED, QUANTITIES, SHIPPED, DeviceFile
+from abbe.drivers.device_file import BUILTIN, FORMAT, NEEDED, QUANTITIES, DeviceFile
 from tests.project.machine_file_page import sections
 from tests.written_page import run
 
@@ -22,7 +22,7 @@ An unknown key is an error. [The how-to](../how-to/own-device.md) writes one.
 def page() -> str:
     """The whole page."""
     schema = DeviceFile.model_json_schema()
-    shipped = "".join(f"| `{path.stem}` | {_title(path)} |\n" for path in sorted(SHIPPED.glob("*.toml")))
+    shipped = "".join(f"| `{path.stem}` | {_title(path)} |\n" for path in sorted(BUILTIN.glob("*.toml")))
     needed = "; ".join(f"`{kind}` needs {', '.join(names)}" for kind, names in NEEDED.items())
     units = "".join(f"| `{name}` | {', '.join(units)} |\n" for name, units in QUANTITIES.items())
     return (

@@ -183,7 +183,7 @@ class OneBankWorld(World):
             return o.OperationRefused(str(error))
         except (NoAnswer, DriverError) as error:
             self.events.append(("doubt", self.process))
-            return o.Doubt(str(error))
+            return o.Unanswered(str(error))
 
     async def _do(self, op: Any) -> Any:
         o, kind, t = self.p.operations, op.kind.name, self.tables

@@ -189,7 +189,7 @@ class World:
             return getattr(self, f"_{op.kind.name.lower()}")(op)
         except NoAnswer as error:
             self.events.append(("doubt", self.process))
-            return o.Doubt(str(error))
+            return o.Unanswered(str(error))
 
     def _look(self, op: Any) -> Any:
         def do() -> Any:
@@ -247,9 +247,9 @@ class World:
             doubt = True
         boot, ack, result = self.request("look", lambda: (ctl.boot, ctl.ack, ctl.result))
         if doubt and boot != self.boot:
-            return o.Doubt("the controller restarted")
+            return o.Unanswered("the controller restarted")
         if ack != number:
-            return o.Doubt("not acknowledged")
+            return o.Unanswered("not acknowledged")
         return o.Done() if result == c.OK else o.OperationRefused(f"result {result}")
 
     def _lease(self, op: Any) -> Any:

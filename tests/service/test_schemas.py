@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from abbe.drivers.device_file import SHIPPED
+from abbe.drivers.device_file import BUILTIN
 from abbe.service.schemas import MODELS, schema_text
 
 FOLDER = Path(__file__).resolve().parents[2] / "docs" / "schemas"
@@ -102,7 +102,7 @@ def test_machine_file_schema_refuses_unknown_keys() -> None:
     assert check("machine-file", {"name": "m", "chain": "w-X-Y-b-Z-t", "stroke_mm": stroke, "x": 1}) == [".x unknown"]
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(BUILTIN.glob("*.toml")), ids=lambda path: path.stem)
 def test_shipped_device_files_keep_to_the_published_schema(path: Path) -> None:
     schema = json.loads((FOLDER / "device-file.schema.json").read_text())
     assert mistakes(tomllib.loads(path.read_text()), schema, schema) == []

@@ -44,7 +44,7 @@ class PoseRank:
         if not self.hidden:
             return out + "."
         out += f"; they hide: {', '.join(self.hidden)}."
-        said = [f"{pose} ({rank} fields{': ' + ', '.join(told) if told else ''})" for pose, rank, told in self.cures[:2]]
+        said = [f"{pose} ({rank} fields{': ' + ', '.join(shown) if shown else ''})" for pose, rank, shown in self.cures[:2]]
         return out + (f" A further pose would show more: {'; or '.join(said)}." if said else " A calibrated length would give the scale.")
 
 
@@ -59,10 +59,10 @@ def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
     keep = [k for k in range(3) if k not in third]
     free = not any(r.points is not None and r.points.source == "length" for r in runs)
     poses = [_flat(axes, p, keep) for axes, p in mine]
-    rank, hidden = _told(poses, scale=free)
+    rank, hidden = _rank_and_hidden(poses, scale=free)
     cures = []
     for name, pose in _candidates(poses):
-        better, left = _told([*poses, pose], scale=free)
+        better, left = _rank_and_hidden([*poses, pose], scale=free)
         if better > rank:
             cures.append((name, better, tuple(h for h in hidden if h not in left)))
     cures.sort(key=lambda one: -one[1])
@@ -94,7 +94,7 @@ def stated_places(axes_mm: F2, matrix: F2, nominal_mm: F2, keep: list[int]) -> F
     return np.asarray(lies + (axes_mm[:, keep] - lies).mean(axis=0))
 
 
-def _told(poses: list[_Pose], *, scale: bool) -> tuple[int, tuple[str, ...]]:
+def _rank_and_hidden(poses: list[_Pose], *, scale: bool) -> tuple[int, tuple[str, ...]]:
     """Rank of the fields beside rigid motions, and the named fields that are hidden."""
     every = np.concatenate([p.at for p in poses])
     middle, reach = 0.5 * (every.min(axis=0) + every.max(axis=0)), float(np.ptp(every, axis=0).max()) / 2.0

@@ -82,7 +82,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     for target in targets:
         write_document(document, target)
     _, word, text = document.verdict or ("", "", "")
-    reduced = [f"{name}: {told}." for name, told in document.conditions.items() if name.startswith((AT_20, DIAGONAL_AT_20))]
+    reduced = [f"{name}: {statement}." for name, statement in document.conditions.items() if name.startswith((AT_20, DIAGONAL_AT_20))]
     doc = {"files": [str(target) for target in targets], "title": document.title, "verdict": word, "text": text}
     lines = [*(f"report: {target}" for target in targets), f"{document.title}: {word}. {text}".strip(), *reduced]
     answer(doc, *lines, as_json=as_json)

@@ -28,7 +28,7 @@ from abbe.service.clock import Clock
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.schedule import Schedule
-from abbe.service.errors import CoreSilent
+from abbe.service.errors import CoreUnavailable
 from abbe.service.web.core_link.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard
 
 SILENT_S = 5.0
@@ -82,12 +82,14 @@ class CoreLine:
     # ---- state of the core ------------------------------------------------------------------------------------------
 
     def snapshot(self) -> Snapshot:
-        """The latest snapshot. Raises CoreSilent if it is older than `SILENT_S`, or there is none yet."""
+        """The latest snapshot. Raises CoreUnavailable if it is older than `SILENT_S`, or there is none yet."""
         if self._snapshot is None:
-            raise CoreSilent("the core of the service has not answered yet", "wait a few seconds")
+            raise CoreUnavailable("the core of the service has not answered yet", "wait a few seconds")
         silent_s = self._clock.monotonic_s() - self._received_s
         if silent_s > SILENT_S:
-            raise CoreSilent(f"the core of the service has not answered for {silent_s:.0f} s", "check the machine, then the service's log")
+            raise CoreUnavailable(
+                f"the core of the service has not answered for {silent_s:.0f} s", "check the machine, then the service's log"
+            )
         return self._snapshot
 
     @property
@@ -125,7 +127,7 @@ class CoreLine:
         return [(due.schedule, due.slot_utc) for due in self.snapshot().due]
 
     def jobs(self) -> tuple[JobState, ...]:
-        """The latest jobs, newest first. Raises CoreSilent as `snapshot` does."""
+        """The latest jobs, newest first. Raises CoreUnavailable as `snapshot` does."""
         self.snapshot()
         return self._jobs
 
@@ -152,31 +154,31 @@ class CoreLine:
     # ---- requests to the core ---------------------------------------------------------------------------------------
 
     async def start(self, recipe: str, key: str, who: str) -> Answer:
-        """Start a job. Raises CoreSilent if no answer comes: then the outcome is unknown; repeat the request with the same key."""
+        """Start a job. Raises CoreUnavailable if no answer comes: then the outcome is unknown; repeat the request with the same key."""
         number = next(self._numbers)
         return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who))
 
     async def steer(self, job: str, how: Steering, who: str) -> Answer:
-        """Stop, abort, pause or resume a running job. Raises CoreSilent if no answer comes."""
+        """Stop, abort, pause or resume a running job. Raises CoreUnavailable if no answer comes."""
         number = next(self._numbers)
         return await self._ask(SteerJob(request=number, job=job, how=how, who=who))
 
     async def confirm_prompt(self, job: str, prompt: int, who: str) -> Answer:
-        """Confirm that a person has carried out a prompt of a job. Raises CoreSilent if no answer comes."""
+        """Confirm that a person has carried out a prompt of a job. Raises CoreUnavailable if no answer comes."""
         return await self._ask(ConfirmPrompt(request=next(self._numbers), job=job, prompt=prompt, who=who))
 
     async def roll_back(self, push: int, crc: int, reason: str, key: str, who: str) -> Answer:
-        """Replace the table in force, given by push and CRC, by the one before it. Raises CoreSilent as `start` does."""
+        """Replace the table in force, given by push and CRC, by the one before it. Raises CoreUnavailable as `start` does."""
         return await self._ask(RollBack(request=next(self._numbers), push=push, crc=crc, reason=reason, key=key, who=who))
 
     async def push(self, proposal: int, key: str, who: str) -> Answer:
-        """Push an approved proposal now. Raises CoreSilent as `start` does."""
+        """Push an approved proposal now. Raises CoreUnavailable as `start` does."""
         return await self._ask(PushNow(request=next(self._numbers), proposal=proposal, key=key, who=who))
 
     async def _ask(self, request: CoreRequest) -> Answer:
         self.snapshot()
         if len(self._waiting) >= MOST_WAITING:
-            raise CoreSilent("too many requests wait for the core of the service", "try again")
+            raise CoreUnavailable("too many requests wait for the core of the service", "try again")
         answer: asyncio.Future[Answer] = asyncio.get_running_loop().create_future()
         self._waiting[request.request] = answer
         try:
@@ -186,7 +188,9 @@ class CoreLine:
                     return await answer
         finally:
             self._waiting.pop(request.request, None)
-        raise CoreSilent("the core of the service did not answer in time", "check whether the request was carried out before you repeat it")
+        raise CoreUnavailable(
+            "the core of the service did not answer in time", "check whether the request was carried out before you repeat it"
+        )
 
 
 def _put(queue: asyncio.Queue[Snapshot | None], snapshot: Snapshot | None) -> None:

@@ -103,16 +103,16 @@ def motions_screen(store: Store, record: SolutionRecord, motion: str) -> Motions
 
 def motion_text(name: str) -> str:
     """An error motion in the reader's words, e.g. "straightness of X in Y"."""
-    say = current().translate
+    translate = current().translate
     if name in SQUARE:
-        return say("motion.square", first=SQUARE[name][0], second=SQUARE[name][1])
+        return translate("motion.square", first=SQUARE[name][0], second=SQUARE[name][1])
     what, axis = name[1], name[2]
     if what == axis:
-        return say("motion.positioning", axis=axis)
+        return translate("motion.positioning", axis=axis)
     if what in "XYZ":
-        return say("motion.straight", axis=axis, out=what)
+        return translate("motion.straight", axis=axis, out=what)
     turn = TURNS.get(what + axis)
-    return say(f"motion.{turn}", axis=axis) if turn else say("motion.tilt", axis=axis, about="XYZ"["ABC".index(what)])
+    return translate(f"motion.{turn}", axis=axis) if turn else translate("motion.tilt", axis=axis, about="XYZ"["ABC".index(what)])
 
 
 def _line(name: str, stored: StoredField, curves: dict[str, MotionCurve], ranked: Ranked) -> MotionLine:
@@ -158,11 +158,11 @@ def _runs(store: Store, record: SolutionRecord, stored: StoredField, solution: S
     change: F1 = sensitivity[:, names.index(motion)] * (1e-2 if _turns(motion) else 10.0)
     noise = np.array([solution.runs[label].expected_um for label in used])
     count = np.array([solution.runs[label].readings for label in used])
-    told = count * (change / noise) ** 2
-    share = told / told.sum() if told.sum() > 0.0 else told
-    say = current()
+    information = count * (change / noise) ** 2
+    share = information / information.sum() if information.sum() > 0.0 else information
+    reader = current()
     lines = [
-        RunLine(label, records[label].id, int(n), say.length(plain(float(c), 2)), say.length(plain(float(s), 2)), float(part))
+        RunLine(label, records[label].id, int(n), reader.length(plain(float(c), 2)), reader.length(plain(float(s), 2)), float(part))
         for label, n, c, s, part in zip(used, count, change, noise, share, strict=True)
     ]
     return sorted(lines, key=lambda one: -one.share)

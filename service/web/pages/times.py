@@ -80,7 +80,7 @@ def trend_screen(reader: Reader, past: Sequence[Verification], status: Status) -
             chart = found.get(key)
             series = None if chart is None else trend_series(chart, points, zone, _marks(key, changes, known))
             plots.append(TrendPlot(trend_picture(key, points, zone, changes), series))
-    return TrendScreen(plots, [_line(one.told) for one in found.values()])
+    return TrendScreen(plots, [_line(one.as_trend) for one in found.values()])
 
 
 def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary]) -> list[tuple[datetime, str, str, str]]:

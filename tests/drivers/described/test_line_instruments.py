@@ -13,7 +13,7 @@ from abbe.drivers.conformance.checks import Move
 from abbe.drivers.conformance.device_test import Options, device_test, summary
 from abbe.drivers.described.opening import described, open_meter, open_source
 from abbe.drivers.described.tested import Ability
-from abbe.drivers.device_file import SHIPPED
+from abbe.drivers.device_file import BUILTIN
 from abbe.drivers.errors import BadFrame, DeviceFault, NotProved, ReplyTimeout
 from abbe.drivers.links.urls import parse_url
 from abbe.drivers.registry import open_controller
@@ -164,7 +164,7 @@ async def test_another_instrument_is_told_by_its_lines(value: Path) -> None:
         await open_meter(parse_url(f"{url}?device=dial-gauge"))
 
 
-@pytest.mark.parametrize("path", sorted(SHIPPED.glob("*.toml")), ids=lambda path: path.stem)
+@pytest.mark.parametrize("path", sorted(BUILTIN.glob("*.toml")), ids=lambda path: path.stem)
 def test_every_shipped_file_is_whole_and_says_where_it_is_from(path: Path) -> None:
     about = described(parse_url(f"socket://127.0.0.1:1?device={path.stem}"))
     assert about.file.source

@@ -14,7 +14,7 @@ from abbe.drivers.conformance.checks import Move
 from abbe.drivers.conformance.device_test import Options, device_test
 from abbe.drivers.described.opening import open_control
 from abbe.drivers.described.tested import Ability
-from abbe.drivers.device_file import SHIPPED
+from abbe.drivers.device_file import BUILTIN
 from abbe.drivers.errors import NotProved, WrongDevice
 from abbe.drivers.links.urls import parse_url
 from abbe.drivers.registry import open_controller
@@ -75,7 +75,7 @@ def plc(tmp_path: Path) -> Iterator[tuple[Plc, str]]:
     server = ModbusServer("127.0.0.1", port, no_block=True, data_bank=made)
     server.start()
     file = tmp_path / "plc.toml"
-    text = (SHIPPED / "plc-positions.toml").read_text()
+    text = (BUILTIN / "plc-positions.toml").read_text()
     file.write_text(text.replace('order = "CDAB" ', 'order = "DCBA" '))
     yield made, f"modbus+tcp://127.0.0.1:{port}?device={file}"
     server.stop()

@@ -55,7 +55,7 @@ MUTANTS = (
     Mutant("grid rounded down", "models/compensation/grid.py", "np.round(table.correction_mm / lsb_mm)", "np.floor(table.correction_mm / lsb_mm)", (GRID + "::test_rounding_costs_what_is_stated_and_keeps_the_reference",)),
     Mutant("grid rounded up", "models/compensation/grid.py", "np.round(table.correction_mm / lsb_mm)", "np.ceil(table.correction_mm / lsb_mm)", (GRID + "::test_rounding_costs_what_is_stated_and_keeps_the_reference",)),
     Mutant("positions of a table rounded down", "drivers/tables.py", "    return round(exact)", "    return math.floor(exact)", (CODEC,)),
-    Mutant("a fence whose answer is lost counts", LEARN, "return known if isinstance(outcome, Doubt) else known._replace(fenced=True, lease=0)", "return known._replace(fenced=True, lease=0)", (SINGLE,)),
+    Mutant("a fence whose answer is lost counts", LEARN, "return known if isinstance(outcome, Unanswered) else known._replace(fenced=True, lease=0)", "return known._replace(fenced=True, lease=0)", (SINGLE,)),
     Mutant("a silent laser is waited for a hundred times longer", "service/sequences/watch.py", "LASER_UNKNOWN_S = 2.5", "LASER_UNKNOWN_S = 250.0", (SILENT,)),
     Mutant("a silent laser counts as one of which only the air is asked", "service/sequences/watch.py", "LASER_UNKNOWN_S if self.beam else", "self._w.air_unknown_s if self.beam else", (SILENT,)),
     Mutant("air of a silent laser is never missed", "service/sequences/watch.py", "if clock() - heard_s > longest_s:", "if clock() - heard_s > longest_s and self.beam:", (SILENT,)),

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.drivers.device_file import SHIPPED
+from abbe.drivers.device_file import BUILTIN
 from abbe.service.cli import run
 
 
@@ -52,13 +52,13 @@ def gauge() -> Iterator[Gauge]:
 def test_the_shipped_files_are_listed(capsys: pytest.CaptureFixture[str]) -> None:
     assert run(["device", "list", "--json"]) == 0
     listed = json.loads(capsys.readouterr().out)
-    assert {one["name"] for one in listed} == {path.stem for path in SHIPPED.glob("*.toml")}
+    assert {one["name"] for one in listed} == {path.stem for path in BUILTIN.glob("*.toml")}
     assert {one["kind"] for one in listed} == {"displacement", "position", "temperature"}
 
 
 def test_a_shipped_file_is_printed_to_be_changed(tmp_path: Path) -> None:
     assert run(["device", "show", "dial-gauge", "--out", str(tmp_path / "mine.toml")]) == 0
-    assert (tmp_path / "mine.toml").read_text() == (SHIPPED / "dial-gauge.toml").read_text()
+    assert (tmp_path / "mine.toml").read_text() == (BUILTIN / "dial-gauge.toml").read_text()
 
 
 def test_without_a_known_motion_a_device_is_only_shown_and_the_report_says_so(

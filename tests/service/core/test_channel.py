@@ -25,7 +25,7 @@ from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial, MachineObject
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
-from abbe.service.errors import ChannelBroken, CoreSilent
+from abbe.service.errors import ChannelBroken, CoreUnavailable
 from abbe.service.storage.store import Store
 from abbe.service.web.core_link.core_line import QUEUE, SILENT_S, CoreLine
 from abbe.service.web.process import import_guard
@@ -251,7 +251,7 @@ async def test_who_does_not_read_is_not_waited_for(pair: Pair) -> None:
 async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> None:
     clock = FakeClock(NOW)
     line = CoreLine(pair.web, clock)
-    with pytest.raises(CoreSilent):
+    with pytest.raises(CoreUnavailable):
         line.snapshot()
     listening = asyncio.create_task(line.listen())
     with line.listener() as snapshots:
@@ -267,9 +267,9 @@ async def test_old_news_are_not_shown_and_listeners_are_bounded(pair: Pair) -> N
         assert heard == list(range(2 * QUEUE + 1, 3 * QUEUE))  # the newest that fit, and the end
     clock.now_s += SILENT_S + 0.1
     for look in (line.snapshot, line.jobs, line.next_due, lambda: line.job, lambda: line.devices):
-        with pytest.raises(CoreSilent):
+        with pytest.raises(CoreUnavailable):
             look()
-    with pytest.raises(CoreSilent):
+    with pytest.raises(CoreUnavailable):
         await line.start("quick-check", "", "user:bob")
 
 

@@ -55,4 +55,4 @@ def test_what_these_poses_hide_is_unknown_and_the_pose_that_tells_is_named(tmp_p
     assert "turned by 90 degrees" in found["poses"]["text"]
     assert "unknown, part or machine: scale, difference of the scales, squareness" in found["verdict"]
     said = CliRunner().invoke(app, ["discover", str(folder), "--without", "p2"]).output
-    assert "A further pose turned by 90 degrees would tell: difference of the scales, squareness" in " ".join(said.split())
+    assert "A further pose turned by 90 degrees would show: difference of the scales, squareness" in " ".join(said.split())

@@ -6,7 +6,7 @@ import httpx
 
 from abbe.service.clock import SystemClock
 from abbe.service.domain.verification import Verification
-from abbe.service.errors import CoreSilent
+from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status
 from abbe.service.web.api.sources import Sources
@@ -17,7 +17,7 @@ from tests.service.web.pages.test_screens import as_user
 
 class Silent:
     async def status(self) -> Status:
-        raise CoreSilent("the core of the service does not answer, for 9 s now", "look at the machine")
+        raise CoreUnavailable("the core of the service does not answer, for 9 s now", "look at the machine")
 
     async def verifications(self, limit: int) -> list[Verification]:
         return []
