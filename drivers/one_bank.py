@@ -116,7 +116,7 @@ class OneBankTables:
         Raises
         ------
         Refused
-            There is no image in it, or the lease is not ours.
+            It has no image, or another session holds the lease.
         """
         if owner != self._owner or bank == self._active or not self._staged or image_in(bytes(self._staged)) != self._staged:
             raise Refused("one table", f"seal bank {bank}", "no image is staged in it, or the lease is not ours")

@@ -48,7 +48,7 @@ class OpcUaControl(ListenedControl):
         Raises
         ------
         WrongDevice
-            A node has no unit, or another than stated, or it is no length.
+            A node has no unit, another unit than stated, or no unit of length.
         LinkDown, ReplyTimeout, BadFrame
             Communication failed, or there is no such node.
         """
@@ -80,7 +80,7 @@ class OpcUaControl(ListenedControl):
         Raises
         ------
         DeviceFault
-            A value's quality is not good, or it is no number.
+            A value is not a number, or its quality is not good.
         LinkDown, ReplyTimeout, BadFrame
             Communication failed.
         """

@@ -111,7 +111,7 @@ async def open_controller(url: str) -> Controller:
 
 
 def no_controller() -> Controller:
-    """Return the stand-in for a control that is not connected: an operator runs the NC program, and nothing is known of its position."""
+    """Return the stand-in for a control that is not connected: an operator runs the NC program, and the position is unknown."""
     return ListenedControl(None, None)
 
 

@@ -314,7 +314,7 @@ class TableRefused(AbbeError):
 
     @classmethod
     def because(cls, reasons: Sequence[str], remedy: str = "nothing was written") -> TableRefused:
-        """Return one refusal for all reasons."""
+        """Return one refusal with all reasons."""
         return cls("; ".join(reasons), remedy, reasons)
 
 

@@ -104,7 +104,9 @@ def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if stamp is not None:
         return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")
     if file.line is not None:
-        return DeviceCheck("freshness", PASSED, "every reading answered a request" if file.line.mode == "poll" else "a line of its own")
+        return DeviceCheck(
+            "freshness", PASSED, "every reading answered a request" if file.line.mode == "poll" else "every reading was a new line"
+        )
     if file.limits.update_s is not None:
         return DeviceCheck(
             "freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s"

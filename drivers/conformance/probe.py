@@ -56,7 +56,7 @@ async def watched(operation: str, call: Awaitable[T]) -> T:
     Raises
     ------
     DriverDefect
-        It had not ended after `CALL_S`, or raised what is no error of `abbe.drivers.errors`.
+        It had not ended after `CALL_S`, or raised an error that is not of `abbe.drivers.errors`.
     """
     try:
         async with asyncio.timeout(CALL_S):

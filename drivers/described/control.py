@@ -91,7 +91,7 @@ class ListenedControl:
         raise NotProved(self.name, operation, f"Abbe can only read this control: {what}", "connect a control that proves it")
 
     async def comp_status(self) -> CompStatus:
-        """Raise NotProved: there is no compensation table to be seen."""
+        """Raise NotProved: no compensation table is visible."""
         self._refuse("read compensation status", "it shows no compensation tables")
 
     async def table_format(self) -> TableFormat:

@@ -98,7 +98,7 @@ class LineSource:
         raise LinkDown(self.name, "wait for silence", "the line never falls silent", "does the device stream? baud rate right?")
 
     async def _line(self) -> tuple[float, str]:
-        """Return the arrival and the text of the next line. Raises ReplyTimeout, LinkDown, or BadFrame for bytes that are no line."""
+        """Return the arrival and the text of the next line. Raises ReplyTimeout, LinkDown, or BadFrame for bytes that are not a line."""
         ends, data, host_s = self._table.ends.encode("ascii"), b"", 0.0
         try:
             async with asyncio.timeout(self._table.timeout_s):

@@ -33,7 +33,7 @@ class DescribedMeter:
     """A displacement sensor. Its zero is its own command, or the reading at that moment, which is then subtracted.
 
     A reading is new if the device's counter or time stamp has changed. Without both, it is new if it was asked for ``update_s`` of the
-    device file later (registers), or because it is the answer to a question of its own, or a line of its own (lines of text).
+    device file later (registers), or because it answers a new request, or is a new line (lines of text).
     """
 
     def __init__(self, file: DeviceFile, source: DeviceSource) -> None:

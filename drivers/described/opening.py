@@ -43,7 +43,7 @@ def described(url: DeviceUrl, kind: Kind | None = None) -> Described:
 
 
 async def open_source(url: DeviceUrl, file: DeviceFile) -> DeviceSource:
-    """Open the wire of a described device; nothing is identified yet.
+    """Open the wire of a described device without identification.
 
     Raises
     ------

@@ -197,7 +197,7 @@ _REPORT = re.compile(r"(?P<before>[?&])tested=(?P<path>[^&#]*)(?P<after>&?)")
 
 
 def split_report(text: str) -> tuple[str, str]:
-    """Return a URL without the report of its device's test, and the path of that report; empty: it names none."""
+    """Return a URL without the report of its device's test, and the path of that report, empty without one."""
     found = _REPORT.search(text)
     if found is None:
         return text, ""

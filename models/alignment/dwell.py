@@ -402,7 +402,7 @@ def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[
 def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
     """Map the index of each place to that of its standstill; ValueError if two assignments are equally good.
 
-    Without ``zero``, try all offsets that pair one of the first few standstills and targets, or one of the last few.
+    Without ``zero``, try all offsets that pair one of the first standstills with one of the first targets, or of the last ones.
     """
     levels = np.array([s.level for s in found])
     if levels.size == 0:

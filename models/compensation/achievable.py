@@ -115,7 +115,7 @@ def motion_tables(
     Raises
     ------
     ValueError
-        A name is not a motion of the solution, there is no name, or (``any_tool``) the data do not separate a motion from others.
+        A name is missing or not a motion of the solution, or (``any_tool``) the data do not separate a motion from others.
     """
     known = {t.motion for t in solution.terms}
     motions = _writable(solution, known, motions, any_tool)

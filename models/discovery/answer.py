@@ -57,7 +57,7 @@ class NamedEffect:
     alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.
     location : where its signal is largest.
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
-    needed : ratio of the holdout runs' rms without this effect to that with it; 1 or less: not needed. None: no holdout run, or a variance
+    needed : rms of the holdout runs without this effect over the rms with it; 1 or less: not needed. None: no holdout run, or a variance
         effect, which changes no mean reading.
     sensor_doubt : why the temperature column of the warming part is probably another's; empty without doubt.
     """

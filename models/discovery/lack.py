@@ -51,7 +51,7 @@ class Floor:
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
     """Noise of each instrument: of repeats, or of neighbours' differences, if clearly less than the fit leaves (what it misses is in that).
 
-    No effect, named or not, enters these two, so neither does the share of a gap that they judge.
+    No effect enters these two, so the share of a gap that they judge is independent of effects.
     """
     left = problem.projection.residual * problem.sd_mm()
     near = fine(left, problem.lengths, problem.kinds, problem.use, problem.projection.leverage)
@@ -101,7 +101,7 @@ def _about_mean(differences: F1) -> F1:
 def lack_of_fit(
     problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
 ) -> Localization | None:
-    """Locate where the residuals of a solution without effects exceed noise; None if they do so nowhere.
+    """Locate residuals of a solution without effects that exceed noise; None without any.
 
     Parameters
     ----------

@@ -362,7 +362,7 @@ class Rival:
 
 
 def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
-    """Return the names that the readings do not exclude in place of pick ``i``, best first; variants of its name are no rivals."""
+    """Return the rivals of pick ``i`` that the readings do not exclude, best first, without variants of its name."""
     picks = [f.pick for f in found]
     rows = others(contest.problem, picks, i)
     own = found[i]

@@ -51,7 +51,7 @@ def structures(case: Case, found: Sequence[Selection], loud: Sequence[VarianceFi
 
 
 def wandering(problem: WhitenedProblem) -> tuple[Structure, ...]:
-    """Return the instruments whose noise remembers more than usual, as structures without a name: no axis, no place and no period."""
+    """Return the instruments with unusually autocorrelated noise, as unnamed structures without axis, place and period."""
     out = []
     for kind, colour in problem.colours.items():
         if colour.gain > 0.0:

@@ -2,7 +2,7 @@
 
 Signals with offsets, unlike gains, or not in quadrature describe an ellipse, and their phase errs once (offsets) and twice (gain,
 quadrature) per fringe. An ellipse is fitted (Heydemann, Appl. Opt. 20 (1981) 3382), robustly against single bad samples. Uncertainties are
-those of a jackknife over blocks of neighbouring samples, so that they hold for noise with a memory and for shapes that are no ellipse.
+those of a jackknife over blocks of neighbouring samples, so that they hold for autocorrelated noise and for shapes other than an ellipse.
 """
 
 from __future__ import annotations

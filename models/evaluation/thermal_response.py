@@ -4,7 +4,7 @@ Every sensor acts twice: at once, and through a first-order lag whose time const
 fast and partly taken back. Sensitivities have one normal prior about zero. The scatter has a memory (Ornstein-Uhlenbeck). Priors, noise and
 time constant are those of largest evidence; time constants are averaged by their evidence. A lag starts in equilibrium.
 
-There are two models. One takes temperatures as they are: the state at the start of a run differs, and temperatures tell it. The other takes
+There are two models. One takes absolute temperatures: the state at the start of a run differs, and temperatures show it. The other takes
 changes since the start, and the reading there. Both have an offset of each run, which is not predicted.
 """
 

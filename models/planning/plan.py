@@ -191,7 +191,7 @@ def plan_campaign(
 def laid_out(search: PlanSearch, chosen: Chosen, budget_min: float, goal_mm: float | None = None) -> MeasuringPlan:
     """Turn a choice of measurements into a plan: order them by gain per minute, label them, stop where the goal (U, mm) is reached.
 
-    A run that only judges joins one of the mountings if the minutes allow it.
+    A holdout run joins one of the mountings if the minutes allow it.
     """
     machine, tools = search.what.machine, search.what.tools
     rows = field_rows(search.what, INNER_SHARE, REPORT_NODES)

@@ -245,7 +245,7 @@ def _reach_mm(test: Measurement) -> float:
 
 
 def _unused(tests: tuple[Measurement, ...]) -> list[Measurement]:
-    """Measurements that the mounting of ``tests`` allows without a person and that are not among them."""
+    """Further measurements that the mounting of ``tests`` allows without a person."""
     last = tests[-1]
     if isinstance(last, HelixTest):
         again: list[Measurement] = [replace(last, direction=-last.direction)]

@@ -111,7 +111,7 @@ def _noise(fit: CampaignFit) -> float:
 
 
 def _scatter(problem: CampaignProblem, fit: CampaignFit, label: str) -> float:
-    """Rms residual of a run in units of its stated noise, with what was left out; gross points count little."""
+    """Rms residual of a run in units of its stated noise, including excluded points; gross points count little."""
     i = next(k for k, r in enumerate(problem.runs) if r.label == label)
     size = problem.split(np.abs(fit.residual_mm) / problem.sigma)[i]
     return float(np.sqrt(np.mean(np.minimum(size, GROSS_SIGMA) ** 2)))

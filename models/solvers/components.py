@@ -296,11 +296,11 @@ def _moved(c: Components, step: F1, model: SizeModel) -> Components:
 
 
 def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
-    """`estimate` with the correlation length of the error motions too, and with the share of their variance at the ends of the strokes.
+    """`estimate`, including the correlation length of the error motions and the share of their variance at the ends of the strokes.
 
-    The smaller share is taken only if the log evidence gains `CLEAR`: where nothing was measured near the ends, a wrong one costs more
-    than a wide one. It is tried at other lengths only if it gains at the best one of the usual share. ``sums`` are those of the
-    unknowns in units of their typical size.
+    The smaller share is taken only if the log evidence gains `CLEAR`: without readings near the ends, a share that is too small costs
+    more than one that is too large. It is tried at other lengths only if it gains at the best length of the usual share.
+    ``sums`` are those of the unknowns in units of their typical size.
     """
     usual, least = ENDS_SHARES
     best = _fit_length(sums, with_shapes(model, model.length, usual), start)

@@ -146,7 +146,7 @@ def map_noise_gain(a: F2, setup: F2, predict: F3) -> F2:
 def shortest_solution(a: F2, y: F1, scale: F1) -> F1:
     """Least squares without a prior; among equally good solutions, the one with the smallest sum of (parameter / scale)**2.
 
-    Without full rank the result depends on ``scale``, which no measurement determines.
+    Without full rank the result depends on ``scale``, an assumption.
 
     Parameters
     ----------

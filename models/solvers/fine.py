@@ -163,7 +163,7 @@ def wave_pair(axis: int, period_mm: float) -> tuple[Fine, Fine]:
 
 
 def _evidence(explained: F1, count: F1) -> F1:
-    """Gain of log evidence if the size of what is left is estimated anew, for so many degrees of freedom."""
+    """Gain of log evidence if the size of the residuals is estimated again, for so many degrees of freedom."""
     return np.asarray(-0.5 * count * np.log(np.maximum(1.0 - explained / count, 0.02)))
 
 

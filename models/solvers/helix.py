@@ -115,7 +115,7 @@ def fit_helix(
     Raises
     ------
     ValueError
-        Fewer readings than unknowns, shapes disagree, or ``unknowns`` is none of the three.
+        Fewer readings than unknowns, shapes disagree, or ``unknowns`` is not one of the three.
 
     Returns
     -------

@@ -182,7 +182,7 @@ def reading_noise_mm(values_mm: F1) -> float:
 
 
 def _belongs(values_mm: F1, key: np.ndarray[tuple[int, ...], np.dtype[np.intp]]) -> np.ndarray[tuple[int, ...], np.dtype[np.bool_]]:
-    """Which readings are no outliers of their block; ``key``: block number of each reading, never decreasing."""
+    """Mask of the readings that are not outliers of their block; ``key``: block number of each reading, never decreasing."""
     away = np.abs(values_mm - _block_median(values_mm, key)[key])
     spread = np.maximum(1.4826 * _block_median(away, key), max(reading_noise_mm(values_mm), LEAST_SPREAD_MM))
     return np.asarray(away <= REJECT_SIGMA * spread[key])

@@ -166,7 +166,7 @@ class SuspectRun:
 
 @dataclass(frozen=True, slots=True)
 class _Run:
-    """A run as it is and with each possible mistake undone.
+    """A run as given, and with each possible mistake corrected.
 
     ``first_setup``: index of the first set-up unknown; ``cleaned``: outliers against the other runs are already removed.
     """
@@ -220,7 +220,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 
 
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
-    """The run without readings that the other runs show to be outliers; None if there are none or too many."""
+    """The run without readings that are outliers by the other runs; None without outliers or with too many."""
     part = run.as_is
     spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)

@@ -1,6 +1,6 @@
 """A solution without the scales of the axes, for runs that do not determine them.
 
-A ball-bar of unknown length cannot tell a common scale from its own length, and a laser along diagonals cannot tell the scales of the axes
+A ball-bar of unknown length cannot separate a common scale from its length; a laser along diagonals cannot separate the scales of the axes
 from the tilt of its mirror. Everything else may be known well. So the best-fit scale over the volume is projected out of the coefficients,
 together with the best-fit rigid motion (`abbe.models.geometry.volume`), and out of every source of their uncertainty.
 """

@@ -281,7 +281,7 @@ class AuditBook:
 
 
 def heads_in(file: Path) -> list[Anchor]:
-    """Return the heads in a file, in their order; none if there is no file.
+    """Return the heads in a file, in their order; empty without a file.
 
     Raises
     ------

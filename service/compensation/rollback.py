@@ -173,7 +173,7 @@ def table_after(journal: JournalView, push: int) -> KnownTable:
 
 
 def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:
-    """The table before the last kept push, which was no rollback and whose table is in force. Raises TableRefused."""
+    """The table before the last kept push. Raises TableRefused if that push was a rollback, or if its table is not in force."""
     last = journal.last_kept()
     f, number = facts(last), last[-1].push
     if f.image != base.image:

@@ -62,7 +62,7 @@ class ServiceSetup:
     duties : callable, optional
         Given the store, returns the reactions of the service to alarms; None: it raises no alarms.
     table : callable, optional
-        Given the store, returns how to look at the table in force; None: it is not watched.
+        Given the store, returns the reader of the table in force; None: it is not watched.
     live : LiveFeed, optional
         Samples of the running path, for the page.
     summary : MachineSummary, optional
@@ -72,7 +72,7 @@ class ServiceSetup:
     campaigns : tuple of str
         Full campaigns that a person may start, if ``campaign`` is given.
     campaign : callable, optional
-        Given the store, returns how to measure, solve and propose one.
+        Given the store, returns the function that measures, solves and proposes one.
     """
 
     machine: str

@@ -1,7 +1,7 @@
 """Watch for an active table that Abbe did not push and verify: detected within seconds, reported once, shown until a person has acted.
 
-Modbus has no passwords: any computer in the machine's network can activate any table. Nothing here writes to the controller or rolls
-back: which table is right is a person's decision (``abbe accept-table``).
+Modbus has no passwords: any computer in the machine's network can activate any table. This module never writes to the controller:
+a person decides which table is right (``abbe accept-table``).
 """
 
 from __future__ import annotations

@@ -34,7 +34,7 @@ def finding_of(
 ) -> Finding:
     """Build the finding of a discovery, including the result of the holdout runs.
 
-    Names that chance also gives, and that holdout runs refute, are none if the present model explains all runs without them.
+    Names that holdout runs refute, and that chance could give, are dropped if the present model explains all runs without them.
 
     ``known_mm``: contribution of the model book's effects, mm by run label, which was subtracted before the search and is added to the
     predictions again. ``thinning``: the decimation of long runs; None without any.

@@ -1,4 +1,4 @@
-"""Facts of a campaign made of other programs' files, beside its runs: origin, readings outside of runs, stated figures."""
+"""Facts of a campaign made of other programs' files, beside its runs: origin, readings without a run, stated figures."""
 
 from __future__ import annotations
 

@@ -1,10 +1,10 @@
 """Share of its commanded path that a run has read, and whether the run is judged: one rule for results, reports, pages and comparisons.
 
-A run that was stopped, aborted, interrupted or failed gives no result, and neither does one that has read less than `LEAST` of its path. A
-complete run with a few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
+A run gives no result if it was stopped, aborted, interrupted or failed, or has read less than `LEAST` of its path. A complete run with a
+few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
 
-Also the positions that runs reach, beyond which a map is assumed, and the axis of a ball-bar path with the angle about it, for counting
-turns here and for drawing them in pages and the live view.
+Also the range of positions of runs (beyond it a map is assumed), and axis and angle of a ball-bar path, to count turns here and to draw
+them in pages and the live view.
 """
 
 from __future__ import annotations

@@ -211,7 +211,7 @@ def _coefficient(expansion: Expansion) -> str:
 
 
 def ways(budget: ScaleBudget, reduction: Reduction, standard: str, u_wavelength: float) -> list[Way]:
-    """The evaluations of a test, the result first: at 20 °C, as measured, and for the workpieces; or only as it is, if not reduced.
+    """The evaluations of a test, the result first: at 20 °C, as measured, and for the workpieces; without a reduction only as measured.
 
     ``budget``: of a test that is not reduced; ``u_wavelength``: relative standard uncertainty of the laser's wavelength.
     """

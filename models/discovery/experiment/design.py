@@ -97,7 +97,7 @@ def propose(
     Returns
     -------
     NextTest or None
-        None without rivals, or if no addition separates them by `LEAST` sigmas more. If none adds `WORTH` sigmas, the one that adds most.
+        None without rivals, or if no addition separates them by `LEAST` sigmas more. If none adds `WORTH` sigmas, the best addition.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:

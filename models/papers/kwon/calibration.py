@@ -244,7 +244,7 @@ class KwonCalibration:
     geometry : Geometry
         Nominal plus estimated deviations.
     frame : array, shape (4, 4)
-        From the base frame to the CMM: estimated, or the one that was given.
+        From the base frame to the CMM: estimated, or as given.
     pivot_mm : array (3,) or None
         Point of the base frame about which the turns of ``frame`` are uncertain; None when the frame was given.
     estimate : ParameterEstimate

@@ -44,7 +44,7 @@ class NoForwardSolution(PoseError):
 
 
 class CollinearSphereCentres(PoseError):
-    """The determinant of the matrix in (4) is 0: seen from above, the sphere centres lie on a line (equal commands: vertical links)."""
+    """The determinant of the matrix in (4) is 0: the sphere centres lie on a line seen from above (vertical links, equal commands)."""
 
 
 class ParallelSingularity(PoseError):

@@ -54,7 +54,7 @@ def confidence_interval(
     Raises
     ------
     ValueError
-        n is below 2 or infinite, the level is outside (0, 1), an sd is negative or not finite, there is no degree of freedom, the law is
+        n is below 2 or infinite, the level is outside (0, 1), an sd is negative or not finite, the degrees of freedom are 0, the law is
         unknown, or the level with "normal" is not 0.95.
     """
     if not 2 <= n < np.inf or not 0.0 < level < 1.0:

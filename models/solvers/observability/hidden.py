@@ -276,7 +276,7 @@ class Advice:
 
 @dataclass(frozen=True)
 class HiddenDirection:
-    """Hidden groups, advice, and the largest rank that runs with the same tools could have."""
+    """Hidden groups, advice, and the largest possible rank of runs with the same tools."""
 
     groups: tuple[HiddenGroup, ...]
     advice: tuple[Advice, ...]
