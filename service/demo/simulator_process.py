@@ -45,14 +45,14 @@ class SimulatorProcess:
     @classmethod
     def of_line(cls, line: str | bytes) -> Self:
         """Parse the line that the simulators print once they answer. Raises ValueError."""
-        ready = parsed(_Ready, json.loads(line))
+        ready = parsed(_ReadyLine, json.loads(line))
         urls = DeviceUrls(ready.cnc, ready.ballbar, ready.laser, ready.fixture)
         plate = None if ready.artefact is None else ArtefactObject.read(ready.artefact)
         return cls(machine_from_doc(ready.machine), urls, plate)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _Ready:
+class _ReadyLine:
     """The keys of that line."""
 
     machine: Doc

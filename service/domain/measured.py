@@ -5,6 +5,7 @@ A process is identified by pid, start time and boot id: the operating system reu
 
 from __future__ import annotations
 
+import math
 import os
 import platform
 from collections.abc import Callable, Sequence
@@ -82,6 +83,69 @@ def arc_of(points_mm: F2 | Sequence[Sequence[float]]) -> F1:
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
+Point = tuple[float, float, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class StandstillRecord:
+    """A stored reading at standstill. ``ctrl_us``: controller time, after the axes had settled."""
+
+    ctrl_us: int
+    target_mm: Point
+    direction: float
+    feed_mm_min: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LaserRecord(StandstillRecord):
+    """A reading of the laser; air in °C and Pa, NaN if unknown; ``missing``: there was no reading at that standstill."""
+
+    displacement_tenth_nm: int
+    status: int
+    signal_permille: int
+    air_temp_c: float = math.nan
+    air_pressure_pa: float = math.nan
+    missing: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class BarRecord(StandstillRecord):
+    """The samples of the ball-bar at one point."""
+
+    device_us: tuple[int, ...]
+    reading_nm: tuple[int, ...]
+    status: tuple[int, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TouchedFeature:
+    """The touches of a hole (``inside``) or ball.
+
+    ``nominal_mm``: in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from the centre to each
+    touch, machine axes; ``touches_mm``: for each side the repeated latched axis positions; ``start_deg``: direction of the first touch;
+    ``resolution_mm``: way between two looks of the control at the probe, 0: none.
+    """
+
+    feature: str
+    inside: bool
+    nominal_mm: Point
+    target_mm: Point
+    sides: tuple[Point, ...]
+    touches_mm: tuple[tuple[Point, ...], ...]
+    start_deg: float
+    feed_mm_min: float = 0.0
+    false_trips: int = 0
+    resolution_mm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TouchRecord(TouchedFeature):
+    """A stored feature; ``ctrl_us``: controller time after its last touch."""
+
+    ctrl_us: int
+    temperature_C: float | None = None  # noqa: N815 - a name of the format
+
+
 @dataclass(frozen=True, kw_only=True, eq=False)
 class RunStart:
     """Facts known when a run begins.
@@ -128,6 +192,11 @@ class RunStart:
     def pieces(self) -> tuple[RunPiece, ...]:
         """The interrupted runs whose readings belong to this one, oldest first; empty for a run without interruption."""
         return () if self.path is None else self.path.pieces
+
+    @property
+    def set_s(self) -> float:
+        """Time of mounting on the campaign's clock as the start document states it, s; 0 if it does not."""
+        return float(self.setup.get("t_set_s", 0.0))
 
     @property
     def point_by_point(self) -> bool:

@@ -265,7 +265,7 @@ class LaserSetup(Setup):
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)
-class Pose:
+class ArtefactPose:
     """Pose of an artefact; ``matrix``: columns are the artefact's axes in machine axes, shape (3, 3)."""
 
     origin_mm: Vector
@@ -281,7 +281,7 @@ class ArtefactSetup(Setup):
 
     artefact: str
     source: str
-    pose: Pose
+    pose: ArtefactPose
     features: ArtefactObject | None = None
     cmm: Doc = field(default_factory=dict, repr=False)
 

@@ -32,7 +32,7 @@ Lines = list[tuple[int, str]]
 
 
 @dataclass(frozen=True, slots=True)
-class _Section:
+class _FileSection:
     """Line of the heading, and the lines below it."""
 
     at: int
@@ -49,28 +49,28 @@ class _Sections:
     last: int = 1
 
     @property
-    def header(self) -> _Section:
+    def header(self) -> _FileSection:
         """What the file is."""
         return self.section("HEADER")
 
     @property
-    def target_data(self) -> _Section:
+    def target_data(self) -> _FileSection:
         """The targets."""
         return self.section("TARGET DATA")
 
     @property
-    def runs(self) -> _Section:
+    def runs(self) -> _FileSection:
         """The number of runs."""
         return self.section("RUNS")
 
     @property
-    def deviations(self) -> _Section:
+    def deviations(self) -> _FileSection:
         """The readings."""
         return self.section("DEVIATIONS")
 
-    def section(self, name: str) -> _Section:
+    def section(self, name: str) -> _FileSection:
         """A section that every file has (`_NEEDED`)."""
-        return _Section(self.at[name], self.lines[name])
+        return _FileSection(self.at[name], self.lines[name])
 
 
 def read_renishaw(name: str, data: bytes) -> Content:

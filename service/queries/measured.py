@@ -153,7 +153,7 @@ def run_summary(record: RunRecord, machine: str) -> RunSummary:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class _State:
+class _StateColumns:
     """The columns of a run that tell its state."""
 
     status: str
@@ -164,7 +164,7 @@ class _State:
 
 
 def _run(row: PageRow) -> RunSummary:
-    found = of_row(_State, row)
+    found = of_row(_StateColumns, row)
     state = visible_status(found.status, Owner(found.owner_host, found.owner_pid, found.owner_start))
     return of_row(RunSummary, row, status=state, reason=_reason(state, found.reason, None))
 

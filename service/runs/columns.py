@@ -16,10 +16,9 @@ from dataclasses import replace
 from typing import Any
 
 from abbe.drivers.api import BarSample
-from abbe.service.domain.artefact import ARTEFACT_TEST
-from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import ChunkRecord, RunEnd, RunRecord, RunStart
-from abbe.service.domain.run import Columns, Run, RunTiming, parsed_setup
+from abbe.service.domain.document import Doc, parsed
+from abbe.service.domain.measured import BarRecord, ChunkRecord, LaserRecord, RunRecord, RunStart, TouchRecord
+from abbe.service.domain.run import AnySetup, ArtefactSetup, BarSetup, Columns, Run, RunTiming, parsed_setup
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of
@@ -194,7 +193,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
             test=record.test,
             role=record.role,
             machine=start.machine,
-            setup=parsed_setup(record.test, _setup(start, record.end)),
+            setup=_setup(record),
             columns=columns,
             table=start.table,  # a solution is meaningful only together with the active table
             timing=RunTiming.from_document(timing),
@@ -221,9 +220,10 @@ def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
     return None if imported is None else dict(imported) | {"columns": unpack_columns(chunks)}  # the key keeps its place
 
 
-def _setup(start: RunStart, end: RunEnd) -> Doc:
+def _setup(record: RunRecord) -> AnySetup:
     """Return the set-up with its mounting time."""
-    return start.setup if end.mounted_us is None else start.setup | {"t_set_s": start.since_zero_s(end.mounted_us)}
+    setup, mounted_us = parsed_setup(record.test, record.start.setup), record.end.mounted_us
+    return setup if mounted_us is None else setup.mounted(record.start.since_zero_s(mounted_us))
 
 
 def pack_columns(columns: Doc) -> list[dict[str, Any]]:
@@ -246,8 +246,14 @@ def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord])
         clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end, edges)
         return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate), clock.doc
     records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
-    make = touch_columns if record.test == ARTEFACT_TEST else bar_point_columns if record.test.startswith("ballbar") else laser_columns
-    return make(records, start), {}
+    setup = _setup(record)
+    if isinstance(setup, ArtefactSetup):
+        return touch_columns([parsed(TouchRecord, one) for one in records], start, setup.pose), {}
+    if isinstance(setup, BarSetup):
+        return bar_point_columns([parsed(BarRecord, one) for one in records], start), {}
+    if setup.nominal_beam is None:
+        raise KeyError("nominal_beam")
+    return laser_columns([parsed(LaserRecord, one) for one in records], start, setup.nominal_beam), {}
 
 
 def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRecord]:

@@ -23,7 +23,7 @@ from abbe.drivers.api import BarSample, bar_is_valid, beam_is_gone, on_path
 from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, breaks, fit_clock, relative_rate
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
-from abbe.service.domain.measured import ChunkRecord, CommandedPath, RunEnd, RunStart
+from abbe.service.domain.measured import BarRecord, ChunkRecord, CommandedPath, LaserRecord, RunEnd, RunStart, StandstillRecord
 from abbe.service.domain.run import Columns
 from abbe.service.errors import MeasurementFault
 
@@ -203,7 +203,7 @@ def _start_s(start: RunStart, end: RunEnd) -> float:
     for stated_us in (end.path_start_us, start.path_start_us, start.clock_us):
         if stated_us is not None:
             return start.since_zero_s(stated_us)
-    return float(start.setup.get("t_set_s", 0.0))
+    return start.set_s
 
 
 def _time_along_path(
@@ -259,14 +259,13 @@ def _position(points: Array, arc_mm: Array) -> Array:
     return np.stack([np.interp(arc_mm, arc, corners[:, axis]) for axis in range(3)], axis=1)
 
 
-def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+def bar_point_columns(records: Sequence[BarRecord], start: RunStart) -> Columns:
     """Convert the records of a point-by-point ball-bar test to columns: one row per point, the mean of its samples.
 
     Parameters
     ----------
-    records : sequence of dict
-        ``ctrl_us`` (controller time, after the axes had settled), ``target_mm``, ``direction``, ``feed_mm_min``, and for every sample
-        ``device_us``, ``reading_nm``, ``status``; in order.
+    records : sequence of BarRecord
+        In order.
     start : RunStart
         The zero of the clock.
 
@@ -277,16 +276,13 @@ def bar_point_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Col
         sample.
     """
     return Columns(
-        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
-        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
-        feed_mm_min=_numbers(records, "feed_mm_min"),
-        direction=_numbers(records, "direction"),
-        deviation_mm=np.array([np.mean(one["reading_nm"]) * 1e-6 for one in records], dtype=np.float64),
-        valid=np.array([all(bar_is_valid(s) for s in one["status"]) for one in records], dtype=np.bool_),
+        **_standstills(records, start),
+        deviation_mm=np.array([np.mean(one.reading_nm) * 1e-6 for one in records], dtype=np.float64),
+        valid=np.array([all(bar_is_valid(s) for s in one.status) for one in records], dtype=np.bool_),
         further={
-            "reading_u_mm": np.array([_u_mm(one["reading_nm"]) for one in records], dtype=np.float64),
-            "samples_count": np.array([len(one["reading_nm"]) for one in records], dtype=np.int64),
-            "device_us": np.array([one["device_us"][0] for one in records], dtype=np.int64),
+            "reading_u_mm": np.array([_u_mm(one.reading_nm) for one in records], dtype=np.float64),
+            "samples_count": np.array([len(one.reading_nm) for one in records], dtype=np.int64),
+            "device_us": np.array([one.device_us[0] for one in records], dtype=np.int64),
         },
     )
 
@@ -301,16 +297,17 @@ MM_PER_COUNT = 1e-7
 """The displacement counts tenths of a nanometre."""
 
 
-def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+def laser_columns(records: Sequence[LaserRecord], start: RunStart, beam: F1) -> Columns:
     """Convert laser records to columns.
 
     Parameters
     ----------
-    records : sequence of dict
-        ``host_s``, ``ctrl_us``, ``target_mm`` [x, y, z], ``direction``, ``displacement_tenth_nm``, ``status``, ``signal_permille``,
-        ``air_temp_c``, ``air_pressure_pa``, ``feed_mm_min``; one for each standstill, in order. ``missing``: no reading at that standstill.
+    records : sequence of LaserRecord
+        One for each standstill, in order.
     start : RunStart
-        Its set-up states the beam.
+        The zero of the clock.
+    beam : array, shape (3,)
+        Nominal beam, unit vector.
 
     Returns
     -------
@@ -319,30 +316,31 @@ def laser_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
         first record, or from the laser's zero if that record is missing. A missing reading is a row with the commanded position, deviation
         0 and ``valid`` 0, so that rows still match standstills.
     """
-    first = records[0] if records else {}
-    beam = start.setup["nominal_beam"]
+    air = {column: np.array([getattr(one, key) for one in records], dtype=np.float64) for column, key in _AIR.items()}
     return Columns(
-        t_s=np.array([start.since_zero_s(one["ctrl_us"]) for one in records], dtype=np.float64),
-        q_mm=np.array([one["target_mm"] for one in records], dtype=np.float64).reshape(-1, 3),
-        feed_mm_min=_numbers(records, "feed_mm_min"),
-        direction=_numbers(records, "direction"),
-        deviation_mm=np.array([_deviation_mm(one, first, beam) for one in records], dtype=np.float64),
-        valid=np.array([not (one.get("missing") or beam_is_gone(one["status"])) for one in records], dtype=np.bool_),
+        **_standstills(records, start),
+        deviation_mm=np.array([_deviation_mm(one, records[0], beam) for one in records], dtype=np.float64),
+        valid=np.array([not (one.missing or beam_is_gone(one.status)) for one in records], dtype=np.bool_),
         further={
-            **{column: _numbers(records, key) for column, key in _AIR.items() if all(key in one for one in records)},
-            "status": np.array([one["status"] for one in records], dtype=np.int64),
-            "signal_permille": np.array([one["signal_permille"] for one in records], dtype=np.int64),
+            **{column: values for column, values in air.items() if not np.isnan(values).any()},
+            "status": np.array([one.status for one in records], dtype=np.int64),
+            "signal_permille": np.array([one.signal_permille for one in records], dtype=np.int64),
         },
     )
 
 
-def _deviation_mm(one: dict[str, Any], first: dict[str, Any], beam: Sequence[float]) -> float:
-    if one.get("missing"):
+def _standstills(records: Sequence[StandstillRecord], start: RunStart) -> dict[str, Any]:
+    """Return the columns that every run at standstills has."""
+    return {
+        "t_s": np.array([start.since_zero_s(one.ctrl_us) for one in records], dtype=np.float64),
+        "q_mm": np.array([one.target_mm for one in records], dtype=np.float64).reshape(-1, 3),
+        "feed_mm_min": np.array([one.feed_mm_min for one in records], dtype=np.float64),
+        "direction": np.array([one.direction for one in records], dtype=np.float64),
+    }
+
+
+def _deviation_mm(one: LaserRecord, first: LaserRecord, beam: F1) -> float:
+    if one.missing:
         return 0.0
-    nominal_mm = sum(b * (now - before) for b, now, before in zip(beam, one["target_mm"], first["target_mm"], strict=True))
-    return float((one["displacement_tenth_nm"] - first["displacement_tenth_nm"]) * MM_PER_COUNT - nominal_mm)
-
-
-def _numbers(records: Sequence[dict[str, Any]], key: str) -> Array:
-    """Return one number of each record, shape (n,). Raises TypeError for null, which NumPy would turn into NaN."""
-    return np.array([float(one[key]) for one in records], dtype=np.float64)
+    nominal_mm = sum(b * (now - before) for b, now, before in zip(beam.tolist(), one.target_mm, first.target_mm, strict=True))
+    return float((one.displacement_tenth_nm - first.displacement_tenth_nm) * MM_PER_COUNT - nominal_mm)

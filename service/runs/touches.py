@@ -1,22 +1,15 @@
-"""From the touches of a hole or ball to its centre: the only place where latched positions become columns of an artefact's run.
-
-A record of one feature: ``feature``, ``inside`` (a hole), ``nominal_mm`` (artefact axes), ``target_mm`` (axis position expected for its
-centre), ``sides`` (unit vectors from the centre to each touch, machine axes), ``touches_mm`` (for each side the repeated latched axis
-positions), ``start_deg`` (direction of the first touch), ``ctrl_us``, ``feed_mm_min``, ``resolution_mm`` (way between two looks of the
-control at the probe; absent or 0: none), ``temperature_C`` where one is known.
-"""
+"""From the touches of a hole or ball to its centre: the only place where latched positions become columns of an artefact's run."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.service.domain.measured import RunStart
-from abbe.service.domain.run import Columns
+from abbe.service.domain.measured import RunStart, TouchedFeature, TouchRecord
+from abbe.service.domain.run import ArtefactPose, Columns
 
 LEAST_U_MM = 1e-5
 ROUNDS = 6
@@ -31,10 +24,10 @@ class FoundFeature:
     spread_mm: float
 
 
-def found_feature(record: dict[str, Any]) -> FoundFeature:
+def found_feature(touched: TouchedFeature) -> FoundFeature:
     """Fit a circle (hole; the height stays as expected) or a sphere (ball) to the touches of a feature."""
-    target, sides = np.asarray(record["target_mm"], dtype=np.float64), np.asarray(record["sides"], dtype=np.float64)
-    each = [np.asarray(side, dtype=np.float64) for side in record["touches_mm"]]
+    target, sides = np.asarray(touched.target_mm, dtype=np.float64), np.asarray(touched.sides, dtype=np.float64)
+    each = [np.asarray(side, dtype=np.float64) for side in touched.touches_mm]
     means, free = np.array([side.mean(axis=0) for side in each]), _free(sides)
     centre, radius = target.copy(), float(np.einsum("ni,ni->n", means - target, sides).mean())
     for _ in range(ROUNDS):
@@ -59,7 +52,7 @@ def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> f
     return max(float(np.hypot(spread_mm / np.sqrt(2.0 * repeats), resolution_mm / np.sqrt(24.0))), LEAST_U_MM)
 
 
-def touch_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns:
+def touch_columns(records: Sequence[TouchRecord], start: RunStart, pose: ArtefactPose) -> Columns:
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
     ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches over
@@ -67,16 +60,20 @@ def touch_columns(records: Sequence[dict[str, Any]], start: RunStart) -> Columns
     from one side and the radius, is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
     found = [found_feature(record) for record in records]
-    pose = start.setup["pose"]
-    origin, matrix = np.array(pose["origin_mm"], dtype=np.float64), np.array(pose["matrix"], dtype=np.float64)
-    deviation = [(f.centre_mm - origin) @ matrix - np.array(r["nominal_mm"]) for f, r in zip(found, records, strict=True)]
+    deviation = [(f.centre_mm - pose.origin_mm) @ pose.matrix - np.array(r.nominal_mm) for f, r in zip(found, records, strict=True)]
     spread = float(np.sqrt(np.mean([f.spread_mm**2 for f in found]))) if found else 0.0
-    doc: dict[str, Any] = {"t_s": [start.since_zero_s(r["ctrl_us"]) for r in records]}
-    doc |= {f"{a}_mm": [round(float(f.centre_mm[k]), 7) for f in found] for k, a in enumerate("xyz")}
-    doc["feature"] = [r["feature"] for r in records]
-    for k, a in enumerate("xyz"):
-        unsensed = [k == 2 and r["inside"] for r in records]
-        doc[f"deviation_{a}_mm"] = [None if u else round(float(d[k]), 7) for d, u in zip(deviation, unsensed, strict=True)]
-    doc["u_mm"] = [_repeatability_mm(spread, len(r["touches_mm"][0]), r.get("resolution_mm", 0.0)) for r in records]
-    doc |= {"temperature_C": [r.get("temperature_C") for r in records], "touch_start_deg": [r["start_deg"] for r in records]}
-    return Columns.from_document(doc)
+    unsensed = {a: [k == 2 and r.inside for r in records] for k, a in enumerate("xyz")}
+    return Columns.from_document(
+        {"t_s": [start.since_zero_s(r.ctrl_us) for r in records]}
+        | {f"{a}_mm": [round(float(f.centre_mm[k]), 7) for f in found] for k, a in enumerate("xyz")}
+        | {"feature": [r.feature for r in records]}
+        | {
+            f"deviation_{a}_mm": [None if u else round(float(d[k]), 7) for d, u in zip(deviation, unsensed[a], strict=True)]
+            for k, a in enumerate("xyz")
+        }
+        | {
+            "u_mm": [_repeatability_mm(spread, len(r.touches_mm[0]), r.resolution_mm) for r in records],
+            "temperature_C": [r.temperature_C for r in records],
+            "touch_start_deg": [r.start_deg for r in records],
+        }
+    )

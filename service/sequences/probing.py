@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from abbe.drivers.api import Latch, Motion, Point, Probing, can_touch
+from abbe.service.domain.document import parsed
+from abbe.service.domain.measured import TouchedFeature
 from abbe.service.errors import ConfigError, FalseTrips, MissedContact, Obstructed, ProbeNotReady, ProbeUncalibrated, SetupDisturbed
 from abbe.service.runs.touches import found_feature
 from abbe.service.sequences.steps import TouchFeature
@@ -107,7 +109,7 @@ class FeatureTouch:
             "feed_mm_min": step.touch_feed_mm_min, "resolution_mm": self._period_s * step.touch_feed_mm_min / 60.0,
             "false_trips": self.false_trips,
         }  # fmt: skip
-        self._check_radius(found_feature(record).radius_mm)
+        self._check_radius(found_feature(parsed(TouchedFeature, record)).radius_mm)
         return record
 
     async def _ready(self) -> None:
@@ -221,14 +223,14 @@ class FeatureTouch:
             )
 
 
-def check_unmoved(record: dict[str, Any], earlier: list[dict[str, Any]]) -> None:
+def check_unmoved(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> None:
     """Compare a feature with its first touches in the same pose. Raises SetupDisturbed if it is elsewhere now."""
-    before = next((one for one in earlier if one["feature"] == record["feature"]), None)
+    before = next((one for one in earlier if one.feature == touched.feature), None)
     if before is None:
         return
-    moved = math.dist(found_feature(record).centre_mm, found_feature(before).centre_mm)
+    moved = math.dist(found_feature(touched).centre_mm, found_feature(before).centre_mm)
     if moved > MOVED_MM:
         raise SetupDisturbed(
-            f"feature {record['feature']} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: the artefact is loose",
+            f"feature {touched.feature} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: the artefact is loose",
             "its points so far are kept as evidence; it is clamped anew and measured from the beginning",
         )

@@ -10,6 +10,8 @@ from typing import Any
 from abbe.drivers.api import BallBar, BarSample, ControllerStatus, Point, air_doc, air_is_compensated, bar_is_out, bar_is_valid
 from abbe.drivers.errors import Refused
 from abbe.service.devices.session import Session
+from abbe.service.domain.document import parsed
+from abbe.service.domain.measured import LaserRecord, TouchRecord
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
@@ -251,9 +253,9 @@ class Runner:
 
     async def _same_as(self, last: dict[str, Any], recorder: Recorder, carried: tuple[dict[str, Any], ...]) -> None:
         """Read the last complete point again: only an equal reading proves an undisturbed set-up and an unbroken count."""
-        status = await self._settled(0.3)
-        record = await self._laser_record(status, tuple(last["target_mm"]), int(last["direction"]))
-        off_mm = abs(record["displacement_tenth_nm"] - last["displacement_tenth_nm"]) * MM_PER_COUNT
+        status, before = await self._settled(0.3), parsed(LaserRecord, last)
+        now = parsed(LaserRecord, await self._laser_record(status, before.target_mm, int(before.direction)))
+        off_mm = abs(now.displacement_tenth_nm - before.displacement_tenth_nm) * MM_PER_COUNT
         if off_mm > REFERENCE_MM:
             raise SetupDisturbed(
                 f"the last point reads {1e3 * off_mm:.1f} um off its value before the interruption (allowed: {1e3 * REFERENCE_MM:.0f})",
@@ -265,7 +267,7 @@ class Runner:
 
     async def _same_artefact(self, reference: TouchFeature, carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch) -> Point:
         """Touch the first feature again: only an equal place proves an undisturbed artefact. Then keep the earlier features."""
-        check_unmoved(await self._touched(reference, watch), list(carried))
+        check_unmoved(parsed(TouchRecord, await self._touched(reference, watch)), [parsed(TouchRecord, one) for one in carried])
         for one in carried:
             await recorder.add_record(one)
         self._points = len(carried)
@@ -303,7 +305,7 @@ class Runner:
                 await recorder.add_record(await read_bar(self._s.need_ballbar(), step, settled, here))
             case TouchFeature():
                 record = await self._touched(step, watch)
-                check_unmoved(record, self.records)
+                check_unmoved(parsed(TouchRecord, record), [parsed(TouchRecord, one) for one in self.records])
                 await self._kept(record, recorder)
             case FollowPath():
                 await self._stands_at(step.points_mm[0])

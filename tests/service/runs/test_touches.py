@@ -7,11 +7,15 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.service.domain.measured import RunStart
+from abbe.service.domain.document import parsed
+from abbe.service.domain.measured import RunStart, TouchRecord
+from abbe.service.domain.run import ArtefactPose
 from abbe.service.runs.touches import found_feature, touch_columns
 
 SIDES = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
 OFF = np.array([0.31, -0.22, 0.0])
+START = RunStart.from_document({"ctrl0_us": 0})
+POSE = ArtefactPose(origin_mm=np.array([100.0, 80.0, 30.0]), matrix=np.eye(3))
 
 
 def touched(centre: np.ndarray, radius: float, side: list[float], start: np.ndarray) -> np.ndarray:
@@ -22,15 +26,15 @@ def touched(centre: np.ndarray, radius: float, side: list[float], start: np.ndar
     return start + (np.sqrt(along**2 + radius**2 - from_centre @ from_centre) - along) * way
 
 
-def record(centre: np.ndarray, *, ball: bool = False, noise: float = 0.0, **more: Any) -> dict[str, Any]:
+def record(centre: np.ndarray, *, ball: bool = False, noise: float = 0.0, **more: Any) -> TouchRecord:
     target, rng = np.array([100.0, 80.0, 30.0]), np.random.default_rng(1)
     sides = [[0.0, 0.0, 1.0], *SIDES] if ball else SIDES
     at = [touched(centre, 7.0, s, target if not ball else centre) for s in sides]
     touches = [[(p + noise * rng.standard_normal() * np.array(s)).tolist() for _ in range(2)] for p, s in zip(at, sides, strict=True)]
-    return {
+    return parsed(TouchRecord, {
         "feature": "A1", "inside": not ball, "nominal_mm": [0.0, 0.0, 0.0], "target_mm": target.tolist(), "sides": sides,
         "touches_mm": touches, "start_deg": 0.0, "ctrl_us": 2_000_000, "feed_mm_min": 100.0,
-    } | more  # fmt: skip
+    } | more)  # fmt: skip
 
 
 def test_a_hole_beside_its_place_is_found_where_it_is():
@@ -47,8 +51,9 @@ def test_a_ball_is_found_in_all_three_directions():
 
 def test_columns_have_deviations_in_the_axes_of_the_artefact_and_no_height_of_a_hole():
     quarter = [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]
-    start = RunStart.from_document({"ctrl0_us": 1_000_000, "setup": {"pose": {"origin_mm": [100.0, 80.0, 36.0], "matrix": quarter}}})
-    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]) + OFF, noise=1e-3, temperature_C=21.5)], start)
+    start = RunStart.from_document({"ctrl0_us": 1_000_000})
+    pose = ArtefactPose(origin_mm=np.array([100.0, 80.0, 36.0]), matrix=np.array(quarter))
+    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]) + OFF, noise=1e-3, temperature_C=21.5)], start, pose)
     assert columns.t_s.tolist() == [1.0]
     assert columns.further["deviation_x_mm"][0] == pytest.approx(OFF[1], abs=2e-3)
     assert columns.further["deviation_y_mm"][0] == pytest.approx(-OFF[0], abs=2e-3)
@@ -58,14 +63,12 @@ def test_columns_have_deviations_in_the_axes_of_the_artefact_and_no_height_of_a_
 
 
 def test_a_control_that_looks_at_the_probe_now_and_then_makes_a_centre_uncertain_by_the_way_between():
-    start = RunStart.from_document({"ctrl0_us": 0, "setup": {"pose": {"origin_mm": [100.0, 80.0, 30.0], "matrix": np.eye(3).tolist()}}})
-    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), resolution_mm=2e-3)], start)
+    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), resolution_mm=2e-3)], START, POSE)
     late = np.random.default_rng(1).uniform(0.0, 2e-3, (100_000, 2))
     assert columns.further["u_mm"][0] == pytest.approx(np.std(0.5 * (late[:, 0] - late[:, 1])), rel=0.01)
 
 
 def test_a_laser_less_run_has_no_temperature():
-    start = RunStart.from_document({"ctrl0_us": 0, "setup": {"pose": {"origin_mm": [100.0, 80.0, 30.0], "matrix": np.eye(3).tolist()}}})
-    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), ball=True)], start)
+    columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), ball=True)], START, POSE)
     assert np.isnan(columns.further["temperature_C"]).all()
     assert np.isfinite(columns.further["deviation_z_mm"]).all()

@@ -7,7 +7,8 @@ from abbe.drivers.api import Condition, LaserReading
 from abbe.models.machine import Machine
 from abbe.service.campaigns import listen
 from abbe.service.campaigns.listen import Heard, planned_readings, row_times
-from abbe.service.domain.measured import RunStart
+from abbe.service.domain.document import parsed
+from abbe.service.domain.measured import LaserRecord, RunStart
 from abbe.service.runs.observations import run_data
 from abbe.service.runs.sample_columns import MM_PER_COUNT, laser_columns
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
@@ -25,6 +26,10 @@ KINDS = {
     "step diagonal": Diagonal("d", "D", "identify", "ppp", 4, "XYZ"),
     "face diagonal": FaceDiagonal("f", "F", "identify", "XY", "np", steps=6),
 }
+
+
+def columns_of(plan, records):
+    return laser_columns([parsed(LaserRecord, one) for one in records], RunStart.from_document({}), plan.setup.nominal_beam)
 
 
 class Recorder:
@@ -94,7 +99,7 @@ async def listened(recipe, lost, monkeypatch):
     monkeypatch.setattr(listen, "_at_start", there)
     recorder, said = Recorder(), []
     end = await listen.listen_to(Devices(heard), recorder, plan, said.append)
-    return plan, laser_columns(recorder.records, RunStart.from_document({"setup": plan.setup.document})).to_document(), end, said
+    return plan, columns_of(plan, recorder.records).to_document(), end, said
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -135,7 +140,7 @@ async def test_where_the_first_reading_is_missing_the_others_count_from_the_firs
         )
         about = {"ctrl_us": 1_000_000 * k, "status": COMPENSATED, "signal_permille": 900, "air_temp_c": 20.0, "air_pressure_pa": 101325.0}
         records.append(told | about | {"target_mm": list(one.target_mm), "direction": one.direction, "feed_mm_min": 0.0})
-    columns = laser_columns(records, RunStart.from_document({"setup": plan.setup.document})).to_document()
+    columns = columns_of(plan, records).to_document()
     assert columns["valid"][0] == 0
     run = {"run_id": "r", "test": plan.test, "setup": plan.setup.document, "columns": columns}
     assert np.abs(run_data(run_of(run)).deviation_mm).max() < 1e-6
