@@ -52,6 +52,14 @@ BROKEN = """() => [...document.querySelectorAll("main th, main td, main dt, .str
 """Words of a table that are broken inside."""
 
 
+SPILT = """() => [...document.querySelectorAll("main td, main th, main a, main button, main p, main dd, main li > span")].filter(e => {
+  if (!e.offsetParent || e.closest(".scroll, .log, svg, .stage, .sr")) return false;
+  const far = e.getBoundingClientRect().right > innerWidth + 1;
+  return far || (getComputedStyle(e).display !== "inline" && e.clientWidth > 0 && e.scrollWidth > e.clientWidth + 1);
+}).map(e => e.textContent.trim().slice(0, 30))"""
+"""What stands out of its box, or of the window, where nothing scrolls."""
+
+
 class Watch:
     """What a page asked for and complained about."""
 
@@ -125,6 +133,7 @@ def test_every_screen_is_quiet_and_fits(chromium, running, axe, size, scheme, la
             bad += [] if page.get_attribute("html", "lang") == lang else [f"{path}: not in {lang}"]
             bad += [] if page.evaluate(INSIDE) else [f"{path}: scrolls sideways"]
             bad += [f"{path}: broken word {one}" for one in page.evaluate(BROKEN)]
+            bad += [f"{path}: spilt {one}" for one in page.evaluate(SPILT)]
             bad += [f"{path}: small target {one}" for one in page.evaluate(SMALL)]
             bad += [f"{path}: {one}" for one in violations(page, axe, rules)]
             if LONG:
