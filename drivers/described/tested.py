@@ -17,7 +17,7 @@ FORMAT = "abbe-device-test/1"
 class Ability(StrEnum):
     """Use of a device; the second needs more proofs.
 
-    No report of this test lets a device command motion or hold tables: that takes a driver of its own, whose banks, read-back and
+    A device file never allows motion or tables, whatever its test proves: these need a driver, whose banks, read-back and
     compare-and-swap `abbe comp commission` proves.
     """
 

@@ -440,7 +440,7 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
-    """Count what named scatter leaves in the fitted runs as noise of all roles: no model foretells it, so it closes no gap."""
+    """Count the residuals of named scatter in the fitted runs as noise of all roles: scatter cannot be predicted, so it closes no gap."""
     fitted = gaps["identify"]
     scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)
     return {role: replace(g, floor_mm=float(np.sqrt(g.floor_mm**2 + scatter))) for role, g in gaps.items()}

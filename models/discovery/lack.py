@@ -49,7 +49,7 @@ class Floor:
 
 
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
-    """Noise of each instrument: of repeats, or of neighbours' differences, if clearly less than the fit leaves (what it misses is in that).
+    """Noise of each instrument: from repeats, or from differences of neighbours if clearly below the residuals (these hold model errors).
 
     No effect enters these two, so the share of a gap that they judge is independent of effects.
     """
@@ -130,7 +130,7 @@ def lack_of_fit(
 
 
 def unexplained(problem: WhitenedProblem, picks: Sequence[Pick], floor: Mapping[str, Floor], calm: F1) -> float:
-    """Return what picks and simulation leave above the noise ``floor``, in nats of the search; 0 within `TIMES` of it.
+    """Return the residuals of picks and simulation above the noise ``floor``, in nats of the search; 0 within `TIMES` of it.
 
     ``calm``: weight of each reading, shape (n,), 0 where a known effect makes the readings scatter.
     """

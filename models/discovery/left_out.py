@@ -20,8 +20,8 @@ BLOCKS = 5
 def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[str, Floor]) -> Gap | None:
     """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None if a finding has no mean effects.
 
-    Unknowns of the simulation and coefficients of the effects are fitted anew without the block. Which effects, and their non-linear
-    parameters, come from all readings: less than a holdout run, more than residuals.
+    Unknowns of the simulation and coefficients of the effects are fitted anew without the block. Selection and non-linear parameters
+    of the effects come from all readings: weaker evidence than a holdout run, stronger than residuals.
     """
     if not solved.picks:
         return None

@@ -41,7 +41,7 @@ class MixedUp:
 
 
 def mixed_up(problem: WhitenedProblem) -> MixedUp | None:
-    """Find the runs of a problem whose readings are exchanged or reversed; None if putting no run right explains most of the misfit.
+    """Find the runs of a problem whose readings are exchanged or reversed; None if no correction explains most of the misfit.
 
     ``problem``: readings whitened about the present simulation, before any search.
     """

@@ -153,7 +153,7 @@ class Contest:
         return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(np.count_nonzero(problem.use)), seconds)
 
     def look_for_more(self, picks: Sequence[Pick], rows: F2) -> None:
-        """Add to the search what is only tried beside ``picks``, and structures without a name.
+        """Add to the search the effects that are only tried beside ``picks``, and structures without a name.
 
         The latter start at the peaks of the residuals after projection by ``rows``, which project out the picks.
         """

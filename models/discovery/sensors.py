@@ -18,7 +18,7 @@ every own column reaches 0.999."""
 
 
 def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values) -> str:
-    """Say that another temperature column follows a named growth and its own does not; empty if nothing speaks against the columns.
+    """Return a warning if another temperature column follows a named growth and its own does not; empty without such doubt.
 
     Parameters
     ----------

@@ -63,7 +63,7 @@ class PlanStep:
     label, setup_id : str
         Name of the run; name of its set-up, which consecutive steps can share.
     test : HelixTest, DiagonalTest or LineTest
-    role : "identify", or "holdout" for the run that only judges and lowers no uncertainty.
+    role : "identify", or "holdout" for the run that is not fitted and lowers no uncertainty.
     minutes, until_min : float
         Set-up and machine time of this step; of the plan up to the end of this step.
     u_worst_mm, u_mean_mm : float
@@ -122,7 +122,7 @@ class MeasuringPlan:
 
     @property
     def judge(self) -> PlanStep | None:
-        """The run that is not fitted and only judges; None: the minutes are too few for one."""
+        """The holdout run; None: the minutes are too few for one."""
         return next((s for s in self.steps if s.role == "holdout"), None)
 
     @property

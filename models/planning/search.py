@@ -217,7 +217,7 @@ class PlanSearch:
         return chosen
 
     def judge(self, chosen: Chosen, budget_min: float) -> Measurement | None:
-        """The run to judge a plan, never fitted: at a mounting of the plan, so that only the machine can make it deviate.
+        """The holdout run of a plan: at a mounting of the plan, so that only the machine can make it deviate.
 
         The longest bar the other way round, else another step order of a diagonal; None: none fits into what the plan leaves of the
         minutes, and into `JUDGE_SHARE` of them.
@@ -227,7 +227,7 @@ class PlanSearch:
         return max(found, key=_reach_mm, default=None)
 
     def with_room(self, chosen: Chosen, budget_min: float) -> Chosen:
-        """Make room in a full plan for its judge (`judge`): the longest that costs at most `JUDGE_LOSS`; else the plan as it is."""
+        """Make room in a full plan for the longest holdout run (`judge`) that costs at most `JUDGE_LOSS`; else return it unchanged."""
         most = self.criterion(chosen) + JUDGE_LOSS
         tried = {-1.0: chosen}
         for smaller in (chosen, *_without_one(chosen)):

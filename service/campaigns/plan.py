@@ -218,7 +218,7 @@ def temperature_note(plan: MeasuringPlan) -> str:
 
 
 def judge_note(plan: MeasuringPlan) -> str:
-    """Describe the run that only judges, and its price."""
+    """Describe the holdout run and its cost."""
     if plan.judge is None:
         return "no run only judges: the minutes are too few for one, so `abbe discover` can prove no name"
     return f"{plan.judge.label} is not fitted: it judges what is found, for {plan.judge.minutes:.1f} minutes"

@@ -1,4 +1,4 @@
-"""Checks before anything moves: which devices a campaign needs and whether all of them answer, and what is wrong in a machine file.
+"""Checks before anything moves: the devices of a campaign and their answers, and faults of a machine file.
 
 Errors and probable mistakes in a machine file are found at once, not by the schedule at night. `abbe.service.config_schema` refuses
 impossible values (a stroke of 1e9 mm, 68 degrees C) when it reads the file. The laser check takes a reading and ignores the beam, which is

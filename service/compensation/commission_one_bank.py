@@ -31,7 +31,7 @@ NOT_SHOWN = (
 
 
 async def commission_one_bank(controller: Controller, store: Store, site: Site) -> ProvedLevels:
-    """Prove what level 1 needs, and store it; the table in force is the same afterwards.
+    """Prove the capabilities of level 1, and store them; the table in force is the same afterwards.
 
     Raises
     ------

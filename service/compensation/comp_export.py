@@ -91,7 +91,7 @@ def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identifie
 
 
 def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
-    """Say what becomes of badly known scales in the tables; no line if the solution knows them."""
+    """Return lines on uncertain scales in the tables; empty if the solution determines them."""
     scales = scales_badly_known(doc)
     if scales is None:
         return []
@@ -104,7 +104,7 @@ def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
 
 
 def reach_note(doc: dict[str, Any]) -> list[str]:
-    """Say which ends of which axes no run reached, if these are more than a tenth of the stroke: there the tables are assumption."""
+    """Return lines on ends of axes that no run reached, if more than a tenth of the stroke: there the tables are assumptions."""
     machine, notes = machine_from_doc(doc["machine"]), []
     for (axis, (low, high)), (first, last) in zip(doc.get("reached_mm", {}).items(), machine.stroke_mm, strict=False):
         beyond = max(low - first, last - high) / (last - first)

@@ -2,7 +2,7 @@
 
 Beside the exported files ``OUT`` a folder ``OUT.dropped`` holds ``receipt.json`` (`abbe-drop/1`) and ``before/``, the files that lay in the
 control's folder. The receipt is on disk before the first file is written, so an interrupted drop can be taken back. A person loads the
-files at the control. Confirmed is a drop when the control has written its tables into files again and these hold the same corrections; what
+files at the control. A drop is confirmed when the control has written its tables into files again and these hold the same corrections; what
 a person says to have seen is recorded as that, and is not a confirmation.
 """
 

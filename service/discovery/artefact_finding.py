@@ -54,7 +54,7 @@ def only_artefacts(campaign: Campaign) -> bool:
 
 
 def artefact_finding(campaign: Campaign) -> ArtefactFinding:
-    """Solve the campaign and tell part and machine apart. Raises as `solve_runs`."""
+    """Solve the campaign and separate part and machine. Raises as `solve_runs`."""
     solved = solve_runs(campaign.site, campaign.runs, instruments=campaign.doc.get("instruments"))
     joint, rank = solved.joint, pose_rank(solved.joint.data)
     fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())

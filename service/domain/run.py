@@ -196,7 +196,7 @@ class BarSetup(Setup):
 
     ``turns``: number of turns of a helix; ``plane``, ``span_deg``: plane and covered angle of a circle; ``opens``: side of the pole on
     ``axis``, where the spindle is; ``samples``: of a reading at standstill, None for a continuous path. ``law``, ``even``, ``chord_mm``,
-    ``rate_hz``: what else it takes to drive the same path again.
+    ``rate_hz``: further values to repeat the same path.
     """
 
     centre_mm: Vector

@@ -64,8 +64,8 @@ STEP_PLACE_MM = 0.1
 class Solved:
     """Joint solution and, for comparison, the same runs solved by published methods (ten-parameter helix, step diagonals).
 
-    ``flags``: oddities of single runs that are not certainly wrong. ``digests``: hash of every run's data as measured, by run label.
-    ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of what was subtracted from the
+    ``flags``: doubtful features of single runs that may be right. ``digests``: hash of every run's data as measured, by run label.
+    ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of effects subtracted from the
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
     temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs,
     beyond which the map is the prior's. ``inputs``: stated uncertainties that no reading shows.

@@ -113,7 +113,7 @@ class PushActors:
 
 
 def no_actors() -> PushActors:
-    """Actors for a recovery, which asks no question: every answer is no."""
+    """Actors for a recovery without a person: every question is answered with no."""
 
     async def no_reason(journal: Journal) -> list[str]:
         return ["no one is present to check it"]

@@ -95,7 +95,7 @@ def superseded(waiting: Waiting, newer: datetime) -> SlotOutcome:
 
 
 def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindrance | None = None) -> SlotOutcome:
-    """Return the outcome of a slot that is made up for by the run of a later one."""
+    """Return the outcome of a slot that the run of a later slot replaces."""
     why = f"; it had to wait because {hindrance.text}" if hindrance is not None else ""
     return SlotOutcome(
         f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC stands for it{why}"
@@ -120,7 +120,7 @@ def whole_span(name: str, first: datetime, last: datetime) -> SlotOutcome:
 
 
 def caught_up(name: str, instead: Sequence[datetime], by: datetime) -> tuple[str, str]:
-    """Return the code and text of the single alarm for all missed slots that one run makes up for."""
+    """Return the code and text of the single alarm for all missed slots that one run replaces."""
     slots = (
         f"{len(instead)} slots from {instead[0]:%F %R} to {instead[-1]:%F %R} UTC were"
         if len(instead) > 1

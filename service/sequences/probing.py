@@ -224,7 +224,7 @@ class FeatureTouch:
 
 
 def check_unmoved(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> None:
-    """Compare a feature with its first touches in the same pose. Raises SetupDisturbed if it is elsewhere now."""
+    """Compare a feature with its first touches in the same pose. Raises SetupDisturbed if it has moved."""
     before = next((one for one in earlier if one.feature == touched.feature), None)
     if before is None:
         return

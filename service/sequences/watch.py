@@ -261,7 +261,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
 
 
 class Stalls:
-    """While it is open: ``longest_s``, the longest time, s, that this computer did not let the event loop run. It looks every `LOOK_S`."""
+    """While it is open: ``longest_s``, the longest time, s, for which this computer did not run the event loop; measured every `LOOK_S`."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0

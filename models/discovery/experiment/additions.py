@@ -93,7 +93,7 @@ def offers(case: Case) -> tuple[ExperimentOffer, ...]:
 
 
 def judging_run(case: Case) -> NextTest | None:
-    """Return the run that a campaign with ball-bar runs needs to prove a name: not fitted, the other way round; None if it has a judge."""
+    """Return a holdout run in the other direction, needed to prove a name; None if the campaign has a holdout run or no ball-bar run."""
     bars = [r.path for r in case.of("identify") if r.path.kind == "bar"]
     if case.of("holdout") or not bars:
         return None

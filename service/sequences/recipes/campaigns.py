@@ -122,7 +122,7 @@ def discovery_campaign(machine: Machine, *, rate_hz: int = 100, name: str = "dis
 def new_measurement(machine: Machine, *, rate_hz: int = 100, name: str = "anew") -> CampaignPlan:
     """Return the verification with a second helix: the same path slowly back, with the bar left in, to show effects of feed and direction.
 
-    One helix alone cannot tell a constantly warm bar from a longer one.
+    One helix alone cannot distinguish a constantly warm bar from a longer one.
     """
     plan = verification(machine, rate_hz=rate_hz, name=name)
     check = replace(verification_helix(machine, rate_hz=rate_hz), chord_mm=CHORD_MM, even=True)
