@@ -2,7 +2,7 @@
 
 Also tools whose stated vector has the wrong sign in one component. This comes before any effect is blamed: exchanged readings resemble
 hysteresis, lags and lost motion of several axes. A wrong sign that all runs share, of the tool or of a pivot, changes no reading: the error
-motions along the axes take up what it does to the rotations.
+motions along the axes absorb its effect on the rotations.
 """
 
 from __future__ import annotations

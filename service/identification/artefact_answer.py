@@ -1,4 +1,4 @@
-"""Deviation at points from a campaign of artefacts, in the frame that it can know."""
+"""Deviation at points from a campaign of artefacts, in the frame that it determines."""
 
 from __future__ import annotations
 

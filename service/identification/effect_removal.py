@@ -52,10 +52,10 @@ class RemovedEffects:
 def remove_effects(
     store: Store | None, campaign: Campaign, table: CampaignTable, effects: tuple[Effect, ...] | None = None
 ) -> RemovedEffects:
-    """Subtract from a campaign's readings what tables cannot correct.
+    """Subtract effects that tables cannot correct from a campaign's readings.
 
-    This is what ``table``, active during the measurement, did beyond smooth corrections, and those effects of the machine's current model
-    that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
+    These are the effect of ``table``, active during the measurement, beyond smooth corrections, and those effects of the machine's current
+    model that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
 
     Raises
     ------

@@ -99,7 +99,7 @@ def solve_runs(
 
     ``instruments``: those of the campaign file; what they do not know of laser and scales widens the uncertainties (`laser_inputs`).
 
-    ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it or cannot carry it (`map_against_prior`).
+    ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it or do not support it (`map_against_prior`).
 
     Raises
     ------
@@ -231,7 +231,7 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
 
 
 def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssue | None:
-    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs cannot carry them.
+    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs do not support them.
 
     ``instead``: what is done about it, added to the text.
     """

@@ -137,7 +137,7 @@ class Assessment:
     """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed.
 
     ``scale_free``: the same without those scales that are the largest part of the uncertainty, for tables of all the rest; None if none
-    are. ``left_out``: the scales that this one is without; ``joint`` then still has them, ``sources`` and what follows from them do not.
+    are. ``left_out``: the scales that are left out of ``sources`` and its results; ``joint`` still has them.
     """
 
     solved: Solved

@@ -107,7 +107,7 @@ def table_line(removed: TableRemoval) -> str:
 
 
 def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:
-    """Return what to subtract from readings measured with ``table`` on a machine with this lost motion of X, Y, Z, mm.
+    """Return the amounts to subtract from readings measured with ``table`` on a machine with this lost motion of X, Y, Z, mm.
 
     A table that polynomials do not fit, made by hand or for pitch errors, may correct errors outside the models. Then only the effect of
     lost motion on its moves is subtracted.

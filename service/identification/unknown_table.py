@@ -1,9 +1,9 @@
 """Uncertainty from a table that was in force during a campaign and is not available.
 
-Smooth corrections of such a table need no knowledge: they belong to the machine as it was measured. What it did beyond them is bounded: an
+Smooth corrections of such a table need no knowledge: they belong to the machine as it was measured. Its effect beyond them is bounded: an
 axis loses at most its lost motion of each move that the table makes, and straight lines between the table's points differ little from a
-smooth curve. So tables of usual machines are drawn, each leaves a pattern in the readings, and what these patterns do to the solution
-widens the covariance of all unknowns.
+smooth curve. So tables of usual machines are drawn, each leaves a pattern in the readings, and their effect on the solution widens the
+covariance of all unknowns.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ of their entries."""
 
 
 def with_unknown_table(solution: JointSolution) -> JointSolution:
-    """Return the same solution; its covariance includes a table in force of which nothing is known (`JointSolution.table_factor`)."""
+    """Return the same solution; its covariance includes an unknown table in force (`JointSolution.table_factor`)."""
     r = response(solution)
     effect = r.design.T @ (r.weight[:, None] * reading_patterns_mm(solution))
     factor = r.covariance @ effect / np.sqrt(TABLES)
@@ -42,7 +42,7 @@ def with_unknown_table(solution: JointSolution) -> JointSolution:
 
 
 def reading_patterns_mm(solution: JointSolution) -> F2:
-    """Return what each drawn table did to the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
+    """Return the effect of each drawn table on the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
     rng = np.random.default_rng(SEED)
     machine, terms = solution.machine, smooth_terms(ORDER)
     x, y, z = (max(2, round(length / SPACING_MM)) for length in machine.length_mm)

@@ -29,7 +29,7 @@ def print_solution(summary: Assessment, solution: SolutionFile, *, details: bool
 
 
 def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
-    """Return at most ten lines: the verdict, how well the volume is known, the largest errors, and what speaks against them."""
+    """Return at most ten lines: the verdict, how well the volume is known, the largest errors, and objections."""
     from abbe.service.identification.solve_report import worst_line
     from abbe.service.identification.table_removal import table_line
 

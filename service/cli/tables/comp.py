@@ -141,7 +141,7 @@ def write_step(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write the 10 µm step of a format, and say where to measure what before any real table is loaded."""
+    """Write the 10 µm step of a format, the test before any real table is loaded, and print its place and expected reading."""
     from abbe.models.machine import AXES
     from abbe.service.compensation.comp_export import control_for, reference_of, settings_for, write_files
     from abbe.service.errors import FormatRefused

@@ -32,7 +32,7 @@ def drop(  # noqa: PLR0913 - one argument for each option
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Put exported tables where a control reads them, keep what lay there, and confirm by the files that the control writes of its tables.
+    """Put exported tables where a control reads them, keep the previous files, and confirm by the files that the control exports.
 
     One of --to, --back, --seen, --take-back. A person loads the tables at the control.
     """
