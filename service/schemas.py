@@ -14,6 +14,7 @@ from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.run_file import CampaignFile, ErrorsFile, RunFile
 from abbe.service.domain.solution_file import SolutionFile
+from abbe.service.domain.standstill_file import StandstillFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,
@@ -25,6 +26,7 @@ MODELS: dict[str, type[BaseModel]] = {
     "errors": ErrorsFile,
     "solution": SolutionFile,
     "discovery": DiscoveryFile,
+    "standstill": StandstillFile,
 }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from abbe.service.domain.standstill_file import StandstillFile
 from tests.models.evaluation.heated_machine import heated_days
 from tests.service.cli.test_cli import Abbe, abbe
 
@@ -47,7 +48,9 @@ def test_days_of_a_standing_axis_show_its_thermal_response(abbe: Abbe) -> None:
     assert "Heat explains it in part." in done.out
     assert done.err.endswith("next: abbe report heat\n")
     assert "shift of several runs: none that chance does not explain (p > 0.01)" in done.out
-    doc = json.loads(abbe("discover", "heat", "--json").out)
+    told = abbe("discover", "heat", "--json").out
+    StandstillFile.model_validate_json(told)
+    doc = json.loads(told)
     assert doc["rms_um"]["response"] < 0.5 * doc["rms_um"]["static"]
     assert [s["sensor"] for s in doc["sensitivities"]] == ["ambient", "spindle", "bed"]
     assert {len(one["predicted_mm"]) for one in doc["left_out"]} == {200}
