@@ -7,7 +7,7 @@ from functools import cache, cached_property
 
 import numpy as np
 
-from abbe.models.arrays import F1, F2
+from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import design, exact_deviation_mm, travel_sign
 from abbe.models.machine import Machine, with_tool
@@ -175,12 +175,18 @@ def _measured(run: RunData, rng: np.random.Generator) -> RunData:
         reading = np.linalg.norm(p - cup, axis=1) - run.radius_mm + rng.normal(0, 1e-3)
         return replace(run, deviation_mm=reading + rng.normal(0, BAR_SIGMA, len(p)))
     mirror = run.beam + rng.normal(0, 150e-6, 2) @ perpendicular(run.beam)
-    reading = (p - p[0]) @ mirror / (mirror @ run.beam) - (run.axes_mm - run.axes_mm[0]) @ run.beam
+    turned = mirror + np.cross(true_motions(run.axes_mm)[:, :, 3:].sum(axis=1), mirror)  # the mirror is on the spindle
+    reading = np.einsum("ni,ni->n", p - p[0], turned) / (turned @ run.beam) - (run.axes_mm - run.axes_mm[0]) @ run.beam
     return replace(run, deviation_mm=reading + rng.normal(0, LASER_SIGMA, len(p)))
 
 
 def true_deviation(points: F2, tool_mm: F1 | None = None) -> F2:
     """Waves in all 18 error motions, finite rotations."""
+    return exact_deviation_mm(with_tool(MACHINE, tool_mm), points, true_motions(points))
+
+
+def true_motions(points: F2) -> F3:
+    """The error motions, shape (n, 3, 6), mm and rad."""
     wave = np.random.default_rng(70)
     size, length, phase = (
         wave.normal(0, 1, (3, 6)) * np.r_[[4e-3] * 3, [1e-5] * 3],
@@ -190,7 +196,7 @@ def true_deviation(points: F2, tool_mm: F1 | None = None) -> F2:
     motions = np.empty((len(points), 3, 6))
     for a in range(3):
         motions[:, a] = size[a] * np.sin(2 * np.pi * points[:, a, None] / MACHINE.length_mm[a] / length[a] + phase[a])
-    return exact_deviation_mm(with_tool(MACHINE, tool_mm), points, motions)
+    return motions
 
 
 @dataclass(frozen=True)

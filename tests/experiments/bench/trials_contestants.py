@@ -9,8 +9,12 @@ from functools import partial
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import smooth_terms
+from abbe.models.geometry.chain import design
 from abbe.models.solvers.helix import linear_field
 from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observe import predict, run_jacobian, setup_unknowns
+from abbe.models.solvers.priors import Priors, term_prior_sd
 from tests.experiments.bench import trials_case as cases
 from tests.experiments.bench.trials_case import COMMON, TRIALS, HelixCase, LinearCase
 from tests.experiments.mathematics.helix_trials import fit_trials, helix_trials, linear_estimator, linear_trials
@@ -206,10 +210,46 @@ def joint_ours(*, order: int | None = None) -> Contestant:
 
     def result() -> Result:
         found = run()
-        points = np.random.default_rng(1).uniform(cases.MACHINE.stroke_mm[:, 0] + 60, cases.MACHINE.stroke_mm[:, 1] - 60, (200, 3))
+        points = _places()
         return {"points": points, "deviation": found.deviation_mm(points), "unknowns": np.array(len(found.estimate.names))}
 
     return Contestant(run, 1, result)
+
+
+def joint_scipy(order: int = 5) -> Contestant:
+    """`scipy.optimize.least_squares` with our exact readings and derivatives, noise and priors as documented: no sizes, order, outliers or
+    covariance.
+    """
+    from scipy.optimize import least_squares
+
+    runs, terms, priors = cases.joint_case(), smooth_terms(order), Priors()
+    setup = setup_unknowns(runs, priors, cases.MACHINE)
+    sd = np.concatenate([term_prior_sd(cases.MACHINE, terms, priors), np.full(3, priors.backlash_mm), setup.prior_sd])
+    sigma = [cases.BAR_SIGMA if r.kind == "bar" else cases.LASER_SIGMA for r in runs]
+    each = list(zip(runs, sigma, strict=True))
+
+    def left(x: F1) -> F1:
+        return np.concatenate([*((predict(cases.MACHINE, terms, r, setup, sd * x) - r.deviation_mm) / s for r, s in each), x])
+
+    def slope(x: F1) -> F2:
+        return np.concatenate([*(run_jacobian(cases.MACHINE, terms, r, setup, sd * x) * (sd / s) for r, s in each), np.eye(x.size)])
+
+    def run() -> F1:
+        return np.asarray(least_squares(left, np.zeros(sd.size), slope, method="lm").x)
+
+    def result() -> Result:
+        points = _places()
+        return {
+            "points": points,
+            "deviation": design(cases.MACHINE, terms, points) @ (sd * run())[: len(terms)],
+            "unknowns": np.array(sd.size),
+        }
+
+    return Contestant(run, 1, result)
+
+
+def _places() -> F2:
+    return np.random.default_rng(1).uniform(cases.MACHINE.stroke_mm[:, 0] + 60, cases.MACHINE.stroke_mm[:, 1] - 60, (200, 3))
 
 
 TRIAL_CASES: dict[str, dict[str, Callable[[], Contestant]]] = {
@@ -229,6 +269,6 @@ TRIAL_CASES: dict[str, dict[str, Callable[[], Contestant]]] = {
         "uncertainties": lambda: propagation_uncertainties(cases.propagation_case()),
         "gtc": lambda: propagation_gtc(cases.propagation_case()),
     },
-    "joint": {"joint-ours": joint_ours, "joint-order-5": partial(joint_ours, order=5)},
+    "joint": {"joint-ours": joint_ours, "joint-order-5": partial(joint_ours, order=5), "joint-scipy": joint_scipy},
 }
 """Ours first in every case; the rest is compared with it."""

@@ -17,6 +17,7 @@ WORDS = {
     "gtc": "(e) GTC",
     "joint-ours": "ours, solve_joint, order chosen",
     "joint-order-5": "ours, solve_joint(order=5)",
+    "joint-scipy": "(f) scipy least_squares, own Jacobian, order 5, fixed sizes",
 }
 CASE_WORDS = {
     "linear": "60-parameter linear campaign",
