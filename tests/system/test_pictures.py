@@ -34,6 +34,7 @@ SCREENS = {
     "discovery": ("/discovery", 760),
     "volume": ("/volume", 560),
     "proposal": ("/proposal", 760),
+    "motions": ("/motions?motion=EYY", 760),
     "trends": ("/trends", 760),
     "new": ("/new", 760),
 }
