@@ -3,7 +3,8 @@
 Polynomials are too smooth for it, and an artefact has too few points to sample it. Errors that change from position to position get one
 unknown per position of an axis (`abbe.models.solvers.artefact.Fine`); at other positions they count as uncertainty. Periods are searched by
 the score of a sine and cosine, on each axis and on all axes together (screws of one lead). Every probable period enters the model with a
-size weighted by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases).
+size weighted by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases). A period
+found first is searched again beside the others, because an alias may fit best while they are still in the scatter.
 """
 
 from __future__ import annotations
@@ -85,17 +86,26 @@ def refined(problem: CampaignProblem, fit: CampaignFit, solve: Solve) -> tuple[C
     nuggets = _nuggets(problem.runs)
     if not nuggets or not (_noisy(problem, fit) or Score.of(problem, fit).excess(_columns(problem.runs, nuggets)) > NUGGETS):
         return problem, fit
-    waves: tuple[Fine, ...] = ()
+    groups: list[tuple[Fine, ...]] = []
     problem, fit = solve(_with(problem.runs, nuggets))
     for _ in range(LARGEST):
         more, sure = _waves(problem, fit)
         if not more:
             break
-        waves += tuple(w for w in more if w.name not in {one.name for one in waves})
-        problem, fit = solve(_with(problem.runs, (*nuggets, *waves)))
+        groups.append(more)
+        problem, fit = solve(_with(problem.runs, _joined(nuggets, groups)))
         if not sure:
             break
-    return problem, fit
+    for i in range(len(groups) - 1):  # found while the later ones were still in the scatter: an alias may have won
+        beside = solve(_with(problem.runs, _joined(nuggets, groups[:i] + groups[i + 1 :])))
+        groups[i] = _waves(*beside)[0] or groups[i]
+    return solve(_with(problem.runs, _joined(nuggets, groups))) if len(groups) > 1 else (problem, fit)
+
+
+def _joined(nuggets: tuple[Fine, ...], groups: list[tuple[Fine, ...]]) -> tuple[Fine, ...]:
+    """Nuggets and all waves, each name once."""
+    waves = {w.name: w for group in reversed(groups) for w in group}
+    return (*nuggets, *waves.values())
 
 
 def _noisy(problem: CampaignProblem, fit: CampaignFit) -> bool:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, replace
+from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -23,6 +24,9 @@ from abbe.service.sequences.recipes.approach import Array, Coordinate, Feed, Nam
 from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
 
 BALL, HOLE = "xyz", "xy"
+LARGEST_TILT_DEG = 2.0
+"""Of a hole's axis against the stylus: more may bring its shaft to the wall."""
+WAY_POINTS = 9
 Angle = Annotated[float, Limits(ge=-360.0, le=360.0)]
 Millimetres = Annotated[float, Limits(gt=0.0, le=500.0)]
 
@@ -70,6 +74,7 @@ class ArtefactTest(TestRecipe):
         if self.plate is None:
             raise ConfigError(f"test {self.label}: the recipe has no artefact {self.artefact!r}", f"add a table [artefact.{self.artefact}]")
         touches = [self._touch(k, f) for k, f in enumerate(self.plate.features)]
+        self._check_neighbours(touches)
         matrix = self.matrix()
         steps: list[Step] = [MoveTo(self._aside(touches, machine), self.feed_mm_min, guarded=True)]
         steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *self._order(touches)]
@@ -82,6 +87,37 @@ class ArtefactTest(TestRecipe):
         }  # fmt: skip
         known = {self.artefact: self.plate.model_dump(by_alias=True, exclude_none=True)}
         return TestPlan(self.label, ARTEFACT_TEST, self.role, parsed_setup(ARTEFACT_TEST, setup), tuple(steps), known)
+
+    def _approach(self, feature: Feature, *, inside: bool) -> Array:
+        """Return the direction that the stylus comes from, a machine axis. Raises ConfigError for a tilted hole."""
+        out = self.matrix()[:, 2]
+        axis = int(np.argmax(np.abs(out)))
+        along: Array = np.sign(out[axis]) * np.eye(3)[axis]
+        tilt = float(np.degrees(np.arccos(min(float(out @ along), 1.0))))
+        if inside and tilt > LARGEST_TILT_DEG:
+            raise ConfigError(
+                f"artefact {self.artefact}, feature {feature.id}: its hole is tilted by {tilt:.0f} degrees against the stylus",
+                "lay the plate flat or upright; balls may be tilted",
+            )
+        return along
+
+    def _check_neighbours(self, touches: list[TouchFeature]) -> None:
+        """Refuse balls so near to each other that the stylus touches one on its way to another. Raises ConfigError."""
+        balls = [one for one in touches if not one.inside]
+        centres, reach = np.array([one.centre_mm for one in balls]), np.array([one.radius_mm for one in balls])
+        for k, one in enumerate(balls):
+            ways = np.array([[one.above_mm, one.over_mm(side), one.before_mm(side)] for side in one.sides])
+            share = np.linspace(0.0, 1.0, WAY_POINTS)[:, None]
+            places = np.concatenate([a + share * (b - a) for way in ways for a, b in pairwise(way)])
+            free = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=0) - reach
+            free[k] = np.inf
+            near = int(np.argmin(free))
+            if free[near] < self.search_mm:
+                raise ConfigError(
+                    f"artefact {self.artefact}, feature {one.feature}: on the way beside it the stylus comes within {free[near]:.1f} mm of "
+                    f"{balls[near].feature}",
+                    "use a smaller stylus or a smaller search_mm, or leave a feature out",
+                )
 
     def _order(self, touches: list[TouchFeature]) -> Iterator[TouchFeature]:
         for k, one in enumerate(touches):
@@ -109,7 +145,7 @@ class ArtefactTest(TestRecipe):
                 f"artefact {self.artefact}, feature {feature.id}: no room for a stylus of {self.stylus_radius_mm:g} mm radius in this hole",
                 "use a smaller stylus or a smaller search_mm",
             )
-        up = matrix[:, 2]
+        up = self._approach(feature, inside=inside)
         start = 45.0 if self.turned_every and k % self.turned_every == self.turned_every - 1 else 0.0
         centre = np.array(self.origin_mm) + matrix @ np.array(feature.nominal_mm) - (self.depth_mm * up if inside else 0.0)
         clear = self.clear_mm + (self.depth_mm if inside else feature.radius_mm + self.stylus_radius_mm)

@@ -85,3 +85,20 @@ def test_poses_that_verify_a_table_are_kept_out_of_the_solution():
     assert [t.role for t in plan.tests] == ["holdout"]
     with pytest.raises(ConfigError, match="tests of the kind artefact only"):
         verifying_poses(MACHINE, "check", (TEST, object()))
+
+
+def test_balls_are_touched_along_the_stylus_however_the_plate_is_tilted_and_holes_only_if_it_is_not():
+    balls = PLATE.model_copy(update={"features": [f.model_copy(update={"sensed": "xyz"}) for f in PLATE.features]})
+    tilted = touches(replace(TEST, plate=balls, rotation_deg=(30.0, 0.0, 0.0)))
+    assert {t.up for t in tilted} == {(0.0, 0.0, 1.0)}
+    with pytest.raises(ConfigError, match="its hole is tilted by 30 degrees against the stylus"):
+        replace(TEST, rotation_deg=(30.0, 0.0, 0.0)).plan(MACHINE)
+
+
+def test_balls_without_room_between_them_for_the_stylus_are_refused():
+    radius, pitch = PLATE.features[0].radius_mm, PLATE.features[1].nominal_mm[0]
+    big = 0.5 * pitch - 2.0
+    balls = PLATE.model_copy(update={"features": [f.model_copy(update={"sensed": "xyz", "radius_mm": big}) for f in PLATE.features]})
+    assert radius < big
+    with pytest.raises(ConfigError, match=r"feature A1: on the way beside it the stylus comes within -?\d+\.\d mm of B1"):
+        replace(TEST, plate=balls).plan(MACHINE)
