@@ -127,9 +127,9 @@ def _elements(file: TextFile, data: bytes) -> list[_Element]:
     try:
         parser.Parse(_utf8(file, data), True)
     except expat.ExpatError as err:
-        raise file.wrong(err.lineno, f"no XML: {expat.errors.messages[err.code]}", "export the file again") from None
+        raise file.wrong(err.lineno, f"not XML: {expat.errors.messages[err.code]}", "export the file again") from None
     except (LookupError, ValueError) as err:  # of an encoding that Python does not know, or not here
-        raise file.wrong(1, f"no XML: {err}", "export the file again") from None
+        raise file.wrong(1, f"not XML: {err}", "export the file again") from None
     return out
 
 

@@ -89,7 +89,7 @@ def refuse(kind: type[PoseError], bad: NDArray[np.bool_], text: str) -> None:
 
 
 def refuse_first(*faults: Fault) -> None:
-    """Raise the first of these faults that any pose has; its message also counts the poses that have only faults listed after it.
+    """Raise the first fault in the list that any pose has; its message also counts the poses with later faults only.
 
     Parameters
     ----------

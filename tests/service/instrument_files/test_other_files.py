@@ -111,7 +111,7 @@ def test_results_of_a_ball_bar(folder: Folder, encoding: str, machine: str) -> N
 
 def test_what_is_wrong_in_a_b5r(folder: Folder) -> None:
     good = B5R.format(encoding="utf-8", machine="m")
-    assert folder.refused("xy.b5r", good[:700]).startswith("xy.b5r:16: no XML: ")
+    assert folder.refused("xy.b5r", good[:700]).startswith("xy.b5r:16: not XML: ")
     assert folder.refused("xy.b5r", good.replace(">11.4<", ">11,4<")).startswith("xy.b5r:10: AF_CIRCULARITY is '11,4', expected a number")
     twice = good.replace('NAME="AF_SQUARENESS" DT="UT_SQUARENESS"', 'NAME="AF_CIRCULARITY" DT="UT_LENGTH_UM"')
     assert folder.refused("xy.b5r", twice).startswith("xy.b5r:13: a second AF_CIRCULARITY (the first is in line 10)")
