@@ -15,7 +15,7 @@ from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interv
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.storage.engine import parse_url as parse_database
 
 Positive = Annotated[float, Field(gt=0.0)]

@@ -8,7 +8,7 @@ from datetime import date
 from typing import Any
 
 from abbe.service.domain.machine import DeviceUrls
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 
 TEXT = """# A machine file. `abbe check-config` says what is in force, docs/reference/machine-file.md describes every key.
 # Lengths in mm, in the machine's own coordinates.

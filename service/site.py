@@ -13,7 +13,7 @@ from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine import AxisMaterial, DeviceUrls, control_of
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings
 

@@ -28,9 +28,17 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import TableRefused
-from abbe.service.push.limits import Capabilities, PushLimits
+from abbe.service.push.capabilities import Capabilities
 from abbe.service.push.operations import Approval
-from abbe.service.push.validate import Candidate, CandidateContext, EvidenceSeal, content_digest, promise_reason, reasons_against
+from abbe.service.push.validate import (
+    Candidate,
+    CandidateContext,
+    EvidenceSeal,
+    PushLimits,
+    content_digest,
+    promise_reason,
+    reasons_against,
+)
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.sequences.steps import CampaignPlan
@@ -176,7 +184,7 @@ class PushContext:
 class Admission:
     """The token that a push needs: a proposal with no reason against it, and the readings and decisions that prove this.
 
-    ``level``: capability level of the controller (`abbe.service.push.limits`). ``hint``: a warning about the control for people, or empty.
+    ``level``: of the control (`abbe.service.push.capabilities`). ``hint``: a warning about the control for people, or empty.
     """
 
     precheck: PushPrecheck

@@ -17,8 +17,7 @@ from abbe.models.machine import AXES
 from abbe.service.domain.document import Doc, canonical
 from abbe.service.errors import StoreError
 from abbe.service.push.journal import approval_digest
-from abbe.service.push.limits import PushLimits
-from abbe.service.push.validate import Candidate
+from abbe.service.push.validate import Candidate, PushLimits
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image, tables_from_image
 

@@ -22,7 +22,7 @@ from abbe.service.demo.simulator_process import SealedTruth, SimulatorProcess, r
 from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.machine_text import machine_text
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store

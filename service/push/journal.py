@@ -36,7 +36,7 @@ class OperationOrder:
     owner : int
         Owner id of the lease, u32. Its low 16 bits are 0; later leases of the same push count in them.
     level : int
-        Capability level of the controller (`abbe.service.push.limits`).
+        Capability level of the controller (`abbe.service.push.capabilities`).
     attended : bool
         An authorised approver is at the machine.
     chunk_words : int
@@ -272,7 +272,7 @@ def _parsed(doc: Doc) -> PushFacts:
 def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: str, expiry: str) -> str:
     """SHA-256 that an approval binds: exactly this table on exactly this base, for this machine, under these limits, until ``expiry``.
 
-    ``limits``: their digest (`abbe.service.push.limits.PushLimits.digest`).
+    ``limits``: their digest (`abbe.service.push.validate.PushLimits.digest`).
     """
     return hashlib.sha256(canonical([image.hex(), base_image.hex(), machine, limits, expiry])).hexdigest()
 

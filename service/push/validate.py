@@ -1,6 +1,7 @@
-"""A proposed table, and the reasons against it that need no controller: form, numbers, promise, evidence, policy, signature. Pure.
+"""A proposed table, the limits of a table, and the reasons against it that need no controller: form, numbers, promise, evidence, policy.
 
-All reasons are collected, so that a person sees everything at once. Only an empty list admits a table.
+All reasons are collected, so that a person sees everything at once. Only an empty list admits a table. A table beyond a limit is rejected;
+its values are never cut to the limit. Pure.
 """
 
 from __future__ import annotations
@@ -13,7 +14,6 @@ from dataclasses import asdict, dataclass, field, replace
 from itertools import pairwise
 
 from abbe.service.domain.document import canonical
-from abbe.service.push.limits import PushLimits
 
 AXES = ("X", "Y", "Z")
 HEADER_REGISTERS = 24
@@ -23,6 +23,51 @@ WHOLE = 0.01
 """Allowed distance of a value from a whole unit of the table, in units: float noise only."""
 ZERO_MM = 0.5e-6
 """Allowed value at the reference (first position): a table that is not zero there moves the axis as soon as it comes into force."""
+
+
+@dataclass(frozen=True, slots=True)
+class PushLimits:
+    """Every limit that can reject a table. Lengths mm, times h, temperatures °C.
+
+    Parameters
+    ----------
+    value_mm, change_mm : float
+        Largest absolute value, largest change against the table in force.
+    step_mm, slope : float
+        Largest difference of neighbouring values; the same per mm of travel.
+    second_mm : float
+        Largest second difference.
+    gain, k : float
+        Smallest predicted improvement of the rms: relative; and as a multiple of the model's standard uncertainty.
+    beyond : float
+        Largest part of a stroke, 0 to 1, that a table corrects beyond the positions of the runs, at either end.
+    share : float
+        Largest standard uncertainty of the model as a share of the predicted improvement.
+    age_h, temperature_c, drift_mm, runs : float, pair, float, int
+        Largest age of the measurement, range of the air temperature, largest rms residual of the solution in a newer run, fewest runs.
+    unattended_h, walk_mm : float
+        For unattended pushes: hours since the last kept push; largest change of a value over 30 days.
+    """
+
+    value_mm: float = 0.1
+    change_mm: float = 0.05
+    step_mm: float = 0.02
+    slope: float = 0.002
+    second_mm: float = 0.01
+    gain: float = 0.1
+    k: float = 2.0
+    share: float = 0.5
+    age_h: float = 72.0
+    temperature_c: tuple[float, float] = (18.0, 24.0)
+    drift_mm: float = 0.003
+    runs: int = 3
+    unattended_h: float = 24.0
+    walk_mm: float = 0.05
+    beyond: float = 0.25
+
+    def digest(self) -> str:
+        """SHA-256 of the limits. An approval binds it, and so does not hold under other limits."""
+        return hashlib.sha256(canonical(asdict(self))).hexdigest()
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,8 +12,7 @@ from abbe.drivers.tables import TableImage, crc32
 from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.limits import PushLimits
-from abbe.service.push.validate import size_reasons, together_reasons
+from abbe.service.push.validate import PushLimits, size_reasons, together_reasons
 
 KIND_NINE = 1
 

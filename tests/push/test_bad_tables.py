@@ -7,8 +7,7 @@ from random import Random
 
 import pytest
 
-from abbe.service.push.limits import PushLimits
-from abbe.service.push.validate import Candidate, CandidateContext, reasons_against
+from abbe.service.push.validate import Candidate, CandidateContext, PushLimits, reasons_against
 from tests.push.bad_tables import CLASSES, EACH, LSB_MM, NOW_S, good, signed
 from tests.push.loading import real
 from tests.push.world import Case, World

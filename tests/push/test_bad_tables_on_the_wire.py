@@ -13,9 +13,8 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import TableRefused
-from abbe.service.push.limits import PushLimits
 from abbe.service.push.operations import VerificationResult
-from abbe.service.push.validate import reasons_against
+from abbe.service.push.validate import PushLimits, reasons_against
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from tests.faults.sequencer_world import bench

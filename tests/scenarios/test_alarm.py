@@ -31,7 +31,7 @@ from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.verification import CheckResult
 from abbe.service.errors import StoreError
 from abbe.service.jobs.check import run_check
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager

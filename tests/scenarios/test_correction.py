@@ -22,7 +22,7 @@ from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
 from abbe.service.push.execute import semantic_digest_of_tables
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, machine_doc, machine_from_doc

@@ -11,7 +11,7 @@ import pytest
 from abbe.service.compensation.proposals import check_before_runs
 from abbe.service.domain.run import Run
 from abbe.service.errors import TableRefused
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from tests.run_documents import run_of
 
 DOC = {"name": "mill"}

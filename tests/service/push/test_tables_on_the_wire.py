@@ -9,7 +9,7 @@ from abbe.drivers.tables import encode
 from abbe.models.compensation.tables import NineTables, quantise
 from abbe.service.errors import TableRefused
 from abbe.service.push.execute import semantic_digest_of_image, semantic_digest_of_tables
-from abbe.service.push.limits import PushLimits
+from abbe.service.push.validate import PushLimits
 from abbe.service.tables.nine_tables import added, check_test_step, table_image
 
 
