@@ -84,5 +84,5 @@ MUTANTS = (
     Mutant("no table is unverified", "service/tables/table_gate.py", "if crc not in endorsed}", "if False}", (UNVERIFIED,)),
     Mutant("a table that once was a base is fine", "service/tables/table_gate.py", "            if base not in candidates:\n", "            if True:\n", (UNVERIFIED,)),
     Mutant("a kept table is unverified", "service/tables/table_gate.py", "endorsed.add(pushed[push])", "endorsed.discard(pushed[push])", (UNVERIFIED,)),
-    Mutant("a table that a person vouched for is unverified", "service/tables/table_gate.py", 'endorsed.add(int(doc["accepted_crc"]))', 'endorsed.discard(int(doc["accepted_crc"]))', (UNVERIFIED,)),
+    Mutant("a table that a person vouched for is unverified", "service/tables/table_gate.py", "endorsed.add(known.accepted_crc)", "endorsed.discard(known.accepted_crc)", (UNVERIFIED,)),
 )  # fmt: skip
