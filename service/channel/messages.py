@@ -21,7 +21,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial, MachineObject
+from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
@@ -43,12 +43,15 @@ Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
 
 @dataclass(frozen=True, slots=True)
 class RulesSummary:
-    """Limits, certificates, allowed temperature and expansion of the scales from the machine file, as reports use them."""
+    """Limits, certificates, allowed temperature, expansion, instruments and laboratory from the machine file, as reports use them."""
 
     limits_um: dict[str, float]
     calibrated_until: dict[str, date] | None
     temperature_c: tuple[float, float] | None
     materials: dict[str, AxisMaterial] = field(default_factory=dict)
+    instruments: dict[str, str] = field(default_factory=dict)
+    issuer: Issuer | None = None
+    item: Item | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -22,7 +22,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial, MachineObject
+from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
@@ -79,7 +79,15 @@ CORE = [
         8080,
         False,
         (),
-        m.RulesSummary({}, None, None, {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)}),
+        m.RulesSummary(
+            {},
+            None,
+            None,
+            {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)},
+            {"laser": "serial 2"},
+            Issuer(laboratory="L", city="Bonn", country="DE", person="A"),
+            Item(serial="4711"),
+        ),
         m.MachineSummary(
             MachineObject.read({"chain": "w-Y-X-b-Z-t", "vertical_axis": "Z", "stroke_mm": dict.fromkeys("XYZ", (0.0, 600.0))}), 6000.0
         ),
