@@ -60,10 +60,11 @@ class Plc(DataBank):
 
     get_input_registers = get_holding_registers
 
-    def on_holding_registers_change(self, address: int, from_value: int, to_value: int, srv_info: object) -> None:
+    def set_holding_registers(self, address: int, word_list: list[int], srv_info: object = None) -> bool:
         self.written += 1
+        return True
 
-    on_coils_change = on_holding_registers_change
+    set_coils = set_holding_registers
 
     async def person(self, text: str) -> None:
         self.at_um = [at + 5000 * (f"axis {axis}" in text) for at, axis in zip((1000, 2000, 3000), "XYZ", strict=True)]

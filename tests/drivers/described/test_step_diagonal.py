@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import json
+import random
 import shutil
+import struct
+import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import pytest
+from pyModbusTCP.server import DataBank, ModbusServer
 
 from abbe.drivers.conformance.device_test import Options, device_test
 from abbe.drivers.errors import NotProved
@@ -25,7 +30,7 @@ from abbe.service.sequences.recipes.recipe_file import read_recipe
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
-from tests.drivers.described.foreign import HERE, LineWorld, World, program, wait_for
+from tests.drivers.described.foreign import HERE, LineWorld, World, free_port, program, wait_for
 from tests.drivers.described.test_device_test import MOVE, UTC, kept, report_of
 from tests.service.sequences.nc_reader import read_gcode
 
@@ -82,7 +87,7 @@ def track(part: list[tuple[str, F1, float]], beam: F1, at: F1) -> list[tuple[flo
     return out
 
 
-async def solved(url: str, world: World | LineWorld, tmp_path: Path) -> dict[str, Run]:
+async def solved(url: str, world: World | LineWorld | LibraryMeter, tmp_path: Path) -> dict[str, Run]:
     """Measure the diagonals with an instrument whose report is kept, and return the runs by label."""
     here = site(tmp_path, url)
     title, recipes = read_recipe(tmp_path / "recipe.toml")
@@ -133,6 +138,68 @@ async def test_a_modbus_meter_measures_and_the_runs_solve(url: str, world: World
     for run in measured.values():
         assert np.array(run.to_document()["columns"]["temp_air_C"]) == pytest.approx(20.5, abs=1e-3)
     check(measured, tmp_path, capsys)
+
+
+LIBRARY_METER = """
+format = "abbe-device/1"
+kind = "displacement"
+name = "meter of a library"
+source = "this test"
+air = "compensated"
+modbus = {order = "BADC", function = 3}
+identity = [{address = 0, type = "u32", holds = 0x41424245}]
+flags = [{value = "state", bit = 0, means = "beam lost"}]
+[values]
+displacement = {address = 2, type = "f32", unit = "um"}
+time = {address = 4, type = "u32", unit = "ms"}
+counter = {address = 6, type = "u16"}
+state = {address = 7, type = "u16"}
+[limits]
+rate_hz = 500.0
+range_mm = [-1000.0, 1000.0]
+resolution = 0.1
+"""
+
+
+class LibraryMeter(DataBank):
+    """A meter served by pyModbusTCP, which no other part knows: micrometres as floats, each word little-endian."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.random, self.count, self.lost = random.Random(5), 0, 0
+        self.track, self.begin_s, self.first = [(0.0, 0.0)], 0.0, 0
+
+    def run(self, track: Sequence[tuple[float, float]]) -> None:
+        """From now on the target follows a track (s, mm), at 40 ms a reading; the meter's clock goes on."""
+        self.begin_s = self.begin_s + 0.04 * (self.count - self.first) + 0.1 if self.begin_s else time.monotonic() + 0.1
+        self.track, self.first = list(track), self.count
+
+    async def person(self, text: str) -> None:
+        self.lost = int(text.startswith("Block"))
+        self.track = [(0.0, 10.0 if "AWAY" in text else 0.0)]
+
+    def get_holding_registers(self, address: int, number: int = 1, srv_info: object = None) -> list[int]:
+        self.count += 1
+        s = 0.04 * (self.count - self.first)
+        um = 1e3 * float(np.interp(s, *np.array(self.track).T)) + self.random.uniform(-0.3, 0.3)
+        ms = round(1000.0 * (self.begin_s + s if self.begin_s else time.monotonic()))
+        data = struct.pack(">IfIHH", 0x41424245, um, ms, self.count & 0xFFFF, self.lost)
+        return [*struct.unpack("<8H", data), *[0] * 16][address : address + number]
+
+
+async def test_a_meter_of_another_library_measures_and_the_runs_solve(tmp_path: Path, capsys) -> None:
+    world, port, file = LibraryMeter(), free_port(), tmp_path / "meter.toml"
+    file.write_text(LIBRARY_METER)
+    server = ModbusServer("127.0.0.1", port, no_block=True, data_bank=world)
+    server.start()
+    try:
+        url = f"modbus+tcp://127.0.0.1:{port}?device={file}"
+        report = await device_test(url, Options(move=MOVE, ask=world.person), UTC)
+        assert report.failed == ()
+        measured = await solved(f"{url}&tested={kept(report, tmp_path)}", world, tmp_path)
+        check(measured, tmp_path, capsys)
+    finally:
+        server.stop()
 
 
 async def test_a_scale_with_lines_of_text_measures_and_the_runs_solve(require, tmp_path: Path, capsys) -> None:
