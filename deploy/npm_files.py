@@ -41,7 +41,8 @@ class NpmFiles:
     def present(self) -> bool:
         """Whether the folder holds the files of this version."""
         mark = self.folder / "version"
-        return mark.exists() and mark.read_text() == self.version
+        whole = all((self.folder / Path(name).name).is_file() for name in self.files)
+        return whole and mark.exists() and mark.read_text() == self.version
 
     def fetch(self, npm: list[str | Path], scratch: Path) -> None:
         """Fetch the package and put its files into the folder."""
@@ -52,15 +53,18 @@ class NpmFiles:
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != self.sha512:
             raise ValueError(f"{archive.name} has another hash than the one that was pinned")
         part = Path(tempfile.mkdtemp(dir=self.folder.parent))
-        with tarfile.open(archive) as packed:
-            for name in self.files:
-                member = packed.extractfile(f"package/{name}")
-                assert member is not None
-                (part / Path(name).name).write_bytes(member.read())
-        (part / "version").write_text(self.version)
-        part.chmod(0o755)
-        shutil.rmtree(self.folder, ignore_errors=True)
-        part.rename(self.folder)
+        try:
+            with tarfile.open(archive) as packed:
+                for name in self.files:
+                    member = packed.extractfile(f"package/{name}")
+                    assert member is not None
+                    (part / Path(name).name).write_bytes(member.read())
+            (part / "version").write_text(self.version)
+            part.chmod(0o755)
+            shutil.rmtree(self.folder, ignore_errors=True)
+            part.rename(self.folder)
+        finally:
+            shutil.rmtree(part, ignore_errors=True)
 
 
 PACKAGES = {
@@ -91,7 +95,7 @@ def main(names: list[str]) -> int:
         for one in missing:
             try:
                 one.fetch(_npm(Path(scratch)), Path(scratch))
-            except (OSError, subprocess.SubprocessError, ValueError) as error:
+            except (OSError, subprocess.SubprocessError, ValueError, KeyError, tarfile.TarError) as error:
                 print(f"{one.package} was not fetched, so {one.without}: {error}", file=sys.stderr)  # noqa: T201
                 failed = 1
     return failed

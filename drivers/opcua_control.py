@@ -231,7 +231,7 @@ LOGIN = ("user", "password_file")
 
 def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
     """Return the nodes of a URL, and the files and names of its session."""
-    query = dict(parse_qsl(urlsplit(url).query))
+    query = dict(parse_qsl(urlsplit(url).query, keep_blank_values=True))
     access = {key: query.pop(key) for key in (*SECRETS, *LOGIN) if key in query}
     wrong = ""
     if 0 < len(access.keys() & set(SECRETS)) < len(SECRETS):
@@ -253,12 +253,12 @@ async def _secured(client: Any, url: str, access: dict[str, str]) -> None:
     try:
         client.application_uri = _application_uri(access["certificate"])
         await client.set_security(SecurityPolicyBasic256Sha256, access["certificate"], access["key"], server_certificate=access["server"])
+        if "user" in access:
+            client.set_user(access["user"])
+            client.set_password(_first_line(access["password_file"]))
     except (ValueError, TypeError, IndexError, OSError) as error:
         remedy = "PEM files; our certificate needs a URI among its alternative names"
-        raise BadUrl(ascii(url), "open device", f"certificate or key: {error}", remedy) from None
-    if "user" in access:
-        client.set_user(access["user"])
-        client.set_password(_first_line(access["password_file"]))
+        raise BadUrl(ascii(url), "open device", f"certificate, key or password: {error}", remedy) from None
 
 
 def _application_uri(certificate: str) -> str:

@@ -1,12 +1,14 @@
 """The figures of a report as QIF 3.0 results (ISO 23952, .qif): each figure with a limit is a characteristic with its status.
 
-A characteristic of QIF has a limit, so a figure without one stands among the attributes of the results, as text.
+A characteristic of QIF has a limit, so a figure without one stands among the attributes of the results, as text, beside machine, days,
+laboratory and conditions.
 """
 
 from __future__ import annotations
 
 import xml.etree.ElementTree as ET
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import count
 from uuid import UUID, uuid5
 
@@ -32,12 +34,12 @@ def document_qif(document: Document) -> str:
     """
     if not document.figures:
         raise FileFormatError("QIF holds figures; this report has none", "give a campaign with results")
-    judged = [figure for figure in document.figures if figure.limit is not None]
+    judged = [figure for figure in document.figures if finite(figure.limit)]
     numbers = count(1)
     standard, results = next(numbers), next(numbers)
     ids = [tuple(next(numbers) for _ in range(4)) for _ in judged]  # of definition, nominal, item and measurement
     root = ET.Element("QIFDocument", {"xmlns": NAMESPACE, "xmlns:xsi": "http://www.w3.org/2001/XMLSchema-instance"})
-    root.append(_tag("QPId", str(uuid5(_REPORTS, repr(document)))))
+    root.append(_tag("QPId", str(uuid5(_REPORTS, repr(replace(document, issued=""))))))
     root.append(_tag("Header", _tag("Application", _tag("Name", "Abbe")), _tag("Description", document.title)))
     organisation = _tag("Organization", _tag("StandardsOrganizationEnum", "ISO"))
     root.append(_list("StandardsDefinitions", [_tag("Standard", organisation, _tag("Designator", "230"), id=standard)]))
@@ -52,13 +54,18 @@ def document_qif(document: Document) -> str:
 
 
 def _tag(tag: str, /, *inside: ET.Element | str, **attributes: object) -> ET.Element:
-    out = ET.Element(tag, {key: str(value) for key, value in attributes.items()})
+    out = ET.Element(tag, {key: _clean(value) for key, value in attributes.items()})
     for one in inside:
         if isinstance(one, str):
-            out.text = " ".join(printable(one).split())
+            out.text = _clean(one)
         else:
             out.append(one)
     return out
+
+
+def _clean(text: object) -> str:
+    """Text that XML and UTF-8 can hold, in one line."""
+    return " ".join(printable(text).encode(errors="replace").decode().split())
 
 
 def _list(name: str, items: Sequence[ET.Element]) -> ET.Element:
@@ -104,9 +111,12 @@ def _characteristics(figures: Sequence[ReportFigure], ids: Sequence[tuple[int, .
 
 
 def _results(document: Document, judged: Sequence[ReportFigure], ids: Sequence[tuple[int, ...]], number: int) -> ET.Element:
-    others = [figure for figure in document.figures if figure.limit is None]
-    texts = [(f"{figure.group}: {figure.symbol}", _value_text(figure)) for figure in others] + list(document.conditions.items())
-    parts = [_list("Attributes", [_tag("AttributeStr", name=" ".join(printable(name).split()), value=text) for name, text in texts])]
+    others = [figure for figure in document.figures if not finite(figure.limit)]
+    days = {"Measured": " to ".join(dict.fromkeys(document.days))} if document.days is not None else {}
+    laboratory = {} if document.issuer is None else {"Laboratory": document.issuer.laboratory}
+    known = {**document.about, **days, **laboratory, **document.conditions}
+    texts = [(f"{figure.group}: {figure.symbol}", _told(figure)) for figure in others] + list(known.items())
+    parts = [_list("Attributes", [_tag("AttributeStr", name=name, value=text) for name, text in texts])]
     if judged:
         measured = [_measurement(figure, own) for figure, own in zip(judged, ids, strict=True)]
         parts.append(_tag("MeasuredCharacteristics", _list("CharacteristicMeasurements", measured)))
@@ -120,7 +130,7 @@ def _measurement(figure: ReportFigure, ids: tuple[int, ...]) -> ET.Element:
     status = _tag("Status", _tag("CharacteristicStatusEnum", STATUS.get(figure.verdict, "NOT_ANALYZED")))
     parts = [status, _tag("CharacteristicItemId", str(ids[2]))]
     if finite(figure.value):
-        known = {"combinedUncertainty": _decimal(figure.u)} if finite(figure.u) else {}
+        known = {"combinedUncertainty": _decimal(figure.u)} if finite(figure.u) and (figure.u == 0.0 or _decimal(figure.u) != "0") else {}
         parts.append(_tag("Value", _decimal(figure.value), **known, unitName=_unit(figure)))
     return _tag(f"{_KIND}Measurement", *parts, id=ids[3])
 
@@ -130,7 +140,7 @@ def _decimal(value: float | None) -> str:
     return f"{value:.12f}".rstrip("0").rstrip(".")
 
 
-def _value_text(figure: ReportFigure) -> str:
+def _told(figure: ReportFigure) -> str:
     if not finite(figure.value):
         return "not observable"
     known = f"U = {_decimal(COVERAGE * figure.u)} {figure.unit} (k = {COVERAGE:g})" if finite(figure.u) else "U is not known"

@@ -186,7 +186,8 @@ async def test_an_encrypted_control_with_users_is_read_and_no_other_server_is_sp
         ("&user=abbe", "user and password_file need each other"),
         ("&user=abbe&password_file={0}", "over an encrypted session only"),
         ("&certificate={0}&key={0}&server=gone.der", "gone.der: no such file"),
-        ("&certificate={0}&key={0}&server={0}", "certificate or key:"),
+        ("&certificate={0}&key={0}&server={0}", "certificate, key or password:"),
+        ("&certificate=&key=&server=&user=abbe&password_file=", "no such file"),
     ],
 )
 async def test_a_session_that_is_half_secured_is_refused_before_anything_is_sent(tmp_path: Path, more: str, words: str) -> None:
@@ -204,7 +205,7 @@ async def test_a_file_is_put_into_it_and_read_back(plant: Plant) -> None:
         assert (files.names, await files.get("x.tab")) == ({"x.tab", "gone"}, b"old")
         await files.put("x.tab", table)
         assert (plant.content, await files.get("x.tab")) == (table, table)
-        with pytest.raises(BadFrame, match="are the nodes"):
+        with pytest.raises(BadFrame, match="do the nodes"):
             await files.get("gone")
     finally:
         await files.close()

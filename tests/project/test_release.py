@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import base64
+import hashlib
 import importlib.metadata
+import importlib.util
 import re
 import subprocess
 import sys
 import tarfile
 import tomllib
 import zipfile
+from dataclasses import replace
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -46,6 +51,38 @@ def test_the_wheel_carries_two_packages_of_others_with_their_licences() -> None:
     assert all("Copyright" in (path.parent / "LICENSE").read_text(encoding="utf-8") for path in found)
     for folder in folders:
         assert subprocess.run(["git", "check-ignore", "-q", f"{folder}/version"], cwd=ROOT, check=False).returncode in {0, 128}
+
+
+def npm_files() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("npm_files", ROOT / "deploy" / "npm_files.py")
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["npm_files"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_files_of_others_come_whole_and_as_pinned_or_not_at_all(tmp_path: Path) -> None:
+    package, scratch, folder = tmp_path / "thing-1.0.tgz", tmp_path / "scratch", tmp_path / "product" / "thing"
+    scratch.mkdir()
+    folder.parent.mkdir()
+    with tarfile.open(package, "w:gz") as archive:
+        for name in ("a.js", "LICENSE"):
+            (tmp_path / name).write_text(name)
+            archive.add(tmp_path / name, f"package/{name}")
+    npm = [sys.executable, "-c", f"import shutil, sys; shutil.copy({str(package)!r}, sys.argv[-1])"]
+    digest = base64.b64encode(hashlib.sha512(package.read_bytes()).digest()).decode()
+    wanted = npm_files().NpmFiles("thing", "1.0", digest, ("a.js", "LICENSE"), folder, "nothing can be done")
+    with pytest.raises(ValueError, match="another hash"):
+        replace(wanted, sha512="0" * 88).fetch(npm, scratch)
+    with pytest.raises(KeyError):
+        replace(wanted, files=("b.js",)).fetch(npm, scratch)
+    assert list(folder.parent.iterdir()) == []
+    wanted.fetch(npm, scratch)
+    assert wanted.present
+    (folder / "LICENSE").unlink()
+    assert not wanted.present
 
 
 @pytest.fixture(scope="module")

@@ -1,48 +1,62 @@
-"""Events of the OPC UA server: a check has ended, an alarm is new. Earlier events are in the variables only."""
+"""Events of the OPC UA server: a check has ended, an alarm is new. What was known before the server began is in its variables only."""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from datetime import datetime, timedelta
 
 from asyncua import Node, Server, ua
 from asyncua.server.event_generator import EventGenerator
 
 from abbe.service.domain.verification import Verification
 from abbe.service.plant.gather import PlantAlarm, PlantFacts
+from abbe.service.plant.opcua.space import short_text
 from abbe.service.plant.opcua.types import Types
 
 SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 """Severity of a result, 1 to 1000 (OPC 10000-5, 6.4.2); that of an alarm is the highest."""
 
 
-@dataclass(frozen=True, slots=True)
 class News:
-    """Events between two snapshots of the machine, oldest first."""
+    """Tells the checks and alarms that were not shown before. Facts hold the newest only, so times and numbers decide, not the lists.
 
-    checks: tuple[Verification, ...]
-    alarms: tuple[PlantAlarm, ...]
+    ``since``: what ended or rose before is not new.
+    """
 
+    def __init__(self, since: datetime) -> None:
+        self._since, self._check = since, -1
+        self._alarm_utc, self._at_that_time = since, frozenset[PlantAlarm]()
 
-def news(before: PlantFacts, now: PlantFacts) -> News:
-    """Return the checks and alarms of ``now`` that ``before`` did not hold."""
-    known_checks, known_alarms = {check.id for check in before.checks}, set(before.alarms)
-    return News(
-        tuple(check for check in reversed(now.checks) if check.id not in known_checks),
-        tuple(alarm for alarm in reversed(now.alarms) if alarm not in known_alarms),
-    )
+    def checks(self, facts: PlantFacts) -> list[Verification]:
+        """Return the new checks, oldest first."""
+        ended = [one for one in facts.checks if one.started_utc + timedelta(seconds=one.duration_s) > self._since]
+        new = sorted((one for one in ended if one.id > self._check), key=lambda one: one.id)
+        self._check = max([self._check, *(one.id for one in facts.checks)])
+        return new
+
+    def alarms(self, facts: PlantFacts) -> list[PlantAlarm]:
+        """Return the new alarms, oldest first."""
+        new = [
+            one
+            for one in reversed(facts.alarms)
+            if one.at_utc > self._alarm_utc or (one.at_utc == self._alarm_utc and one not in self._at_that_time)
+        ]
+        if new:
+            newest = max(one.at_utc for one in new)
+            before = self._at_that_time if newest == self._alarm_utc else frozenset()
+            self._alarm_utc, self._at_that_time = newest, before | {one for one in new if one.at_utc == newest}
+        return new
 
 
 class Events:
     """Emits events; make it with `Events.prepared`."""
 
-    def __init__(self, results: Sequence[EventGenerator], alarms: Sequence[EventGenerator]) -> None:
-        self._results, self._alarms = results, alarms
-        self._known: PlantFacts | None = None
+    def __init__(self, results: Sequence[EventGenerator], alarms: Sequence[EventGenerator], news: News) -> None:
+        self._results, self._alarms, self._news = results, alarms, news
 
     @classmethod
-    async def prepared(cls, server: Server, types: Types, machine: Node) -> Events:
+    async def prepared(cls, server: Server, types: Types, machine: Node, since: datetime) -> Events:
         """Return the events of a server; ``machine``: their source. Subscribers of the server's node and of the machine's get them."""
         name = (await machine.read_browse_name()).Name
         generators = []
@@ -50,15 +64,14 @@ class Events:
             generators.append([await server.get_event_generator(kind, node) for node in (server.nodes.server, machine)])
             for generator in generators[-1]:
                 generator.event.SourceNode, generator.event.SourceName = machine.nodeid, name
-        return cls(*generators)
+                generator.event.data_types["Identifier"] = ua.VariantType.String  # the nodeset gives it no value, so asyncua no type
+        return cls(*generators, News(since))
 
     async def show(self, facts: PlantFacts) -> None:
-        """Emit what is new since the last call; the first call emits nothing."""
-        new = news(self._known or facts, facts)
-        self._known = facts
-        for check in new.checks:
+        """Emit what is new since the last call."""
+        for check in self._news.checks(facts):
             figures = {one.name: [one.value, one.expanded, one.limit] for one in check.figures}
-            fields = {
+            fields: dict[str, str | int] = {
                 "Number": check.id,
                 "Verdict": check.verdict,
                 "Schedule": check.schedule,
@@ -66,18 +79,17 @@ class Events:
                 "Figures": json.dumps(figures, allow_nan=False),
                 "Identifier": f"check {check.id}",
             }
-            await _emit(self._results, fields, check.text, SEVERITIES[check.verdict])
-        for alarm in new.alarms:
-            await _emit(
-                self._alarms, {"Code": alarm.code, "Device": alarm.device, "Identifier": alarm.code}, alarm.text, SEVERITIES["fail"]
-            )
+            ended = check.started_utc + timedelta(seconds=check.duration_s)
+            await _emit(self._results, fields, check.text, SEVERITIES[check.verdict], ended)
+        for alarm in self._news.alarms(facts):
+            fields = {"Code": alarm.code, "Device": short_text(alarm.device), "Identifier": alarm.code}
+            await _emit(self._alarms, fields, alarm.text, SEVERITIES["fail"], alarm.at_utc)
 
 
-async def _emit(generators: Sequence[EventGenerator], fields: dict[str, str | int], text: str, severity: int) -> None:
+async def _emit(generators: Sequence[EventGenerator], fields: Mapping[str, str | int], text: str, severity: int, at_utc: datetime) -> None:
     for generator in generators:
         for name, value in fields.items():
-            if hasattr(generator.event, name):  # an Identifier only where the companion specifications are
-                setattr(generator.event, name, value)
+            setattr(generator.event, name, value)
         generator.event.Severity = severity
-        generator.event.Message = ua.LocalizedText(text)
-        await generator.trigger()
+        generator.event.Message = ua.LocalizedText(short_text(text))
+        await generator.trigger(at_utc)

@@ -33,6 +33,7 @@ from abbe.service.plant.gather import FactsSource
 from abbe.service.plant.opcua.events import Events
 from abbe.service.plant.opcua.setup import in_force, trusted
 from abbe.service.plant.opcua.space import NAMESPACE, Space, picture_of
+from abbe.service.plant.opcua.types import NodesetBroken, has_companions
 
 MAX_CONNECTIONS = 20
 MAX_SUBSCRIPTIONS = 40
@@ -180,7 +181,7 @@ class OpcUaServer:
         self._built: tuple[Server, Space, Events] | None = None
 
     async def prepare(self) -> None:
-        """Build the address space. Call it before anything moves: it takes 1 to 2 s and blocks the event loop for parts of a second."""
+        """Build the address space. Call it before anything moves: it takes seconds and blocks the event loop for parts of them."""
         self._built = await self._build()
         gc.freeze()  # some hundred thousand permanent objects: without this, every full collection would visit them, for 0.2 s
 
@@ -216,8 +217,13 @@ class OpcUaServer:
 
     async def _build(self) -> tuple[Server, Space, Events]:
         server = await self._make()
-        space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine)
-        events = await Events.prepared(server, space.types, space.root)
+        try:
+            space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine, companions=has_companions())
+        except NodesetBroken as broken:
+            log.error("companion specification cannot be read; served without", reason=str(broken))
+            server = await self._make()
+            space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine, companions=False)
+        events = await Events.prepared(server, space.types, space.root, self._clock.utc())
         await self._show(space, events)
         self.sealed = seal(server.iserver.aspace)
         return server, space, events

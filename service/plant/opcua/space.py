@@ -15,8 +15,8 @@ from abbe.service.domain.verification import Verification
 from abbe.service.plant.gather import PlantAlarm, PlantFacts, PlantUnit, unit_of
 from abbe.service.plant.opcua.types import Types, add_types, variables_under
 
-Value = str | bool | int | float | datetime | list[str] | list[datetime] | None
-Kind = Literal["text", "flag", "count", "real", "time", "texts", "times"]
+Value = str | bool | int | float | datetime | list[str] | list[datetime] | ua.NodeId | None
+Kind = Literal["text", "flag", "count", "real", "time", "texts", "times", "localized", "node"]
 PAST_CHECKS = 10
 MAX_TEXT = 500
 
@@ -57,7 +57,7 @@ def _running(facts: PlantFacts) -> Picture:
         "Check/Recipe": Leaf(now.recipe if now else None, "text"),
         "Check/Since": Leaf(now.since_utc if now else None, "time"),
         "Check/Stage": Leaf(now.stage if now else None, "text"),
-        "Check/Message": Leaf(_short(now.message) if now else None, "text"),
+        "Check/Message": Leaf(short_text(now.message) if now else None, "text"),
         "Check/Progress": Leaf(now.percent if now else None, "real", unit_of("progress_percent")),
         "Check/Remaining": Leaf(now.eta_s if now else None, "real", unit_of("remaining_s")),
     }
@@ -68,7 +68,7 @@ def _last(check: Verification | None, verdict: str | None) -> Picture:
     out = {
         "LastResult/Number": Leaf(check.id if check else None, "count"),
         "LastResult/Verdict": Leaf(verdict, "text"),
-        "LastResult/Text": Leaf(_short(check.text) if check else None, "text"),
+        "LastResult/Text": Leaf(short_text(check.text) if check else None, "text"),
         "LastResult/Schedule": Leaf(check.schedule if check else None, "text"),
         "LastResult/Recipe": Leaf(check.recipe if check else None, "text"),
         "LastResult/Started": Leaf(check.started_utc if check else None, "time"),
@@ -100,8 +100,8 @@ def _alarms(alarms: tuple[PlantAlarm, ...]) -> Picture:
     return {
         "Alarms/Count": Leaf(len(alarms), "count"),
         "Alarms/Codes": Leaf([alarm.code for alarm in alarms], "texts"),
-        "Alarms/Texts": Leaf([_short(alarm.text) for alarm in alarms], "texts"),
-        "Alarms/Devices": Leaf([_short(alarm.device) for alarm in alarms], "texts"),
+        "Alarms/Texts": Leaf([short_text(alarm.text) for alarm in alarms], "texts"),
+        "Alarms/Devices": Leaf([short_text(alarm.device) for alarm in alarms], "texts"),
         "Alarms/Times": Leaf([alarm.at_utc for alarm in alarms], "times"),
     }
 
@@ -123,12 +123,12 @@ def _devices(facts: PlantFacts) -> Picture:
     out: Picture = {}
     for device in facts.devices:
         out[f"Devices/{device.role}/State"] = Leaf(device.state, "text")
-        out[f"Devices/{device.role}/Text"] = Leaf(_short(device.text), "text")
+        out[f"Devices/{device.role}/Text"] = Leaf(short_text(device.text), "text")
         out[f"Devices/{device.role}/LastHeard"] = Leaf(device.at_utc, "time")
     return out
 
 
-def _short(text: str) -> str:
+def short_text(text: str) -> str:
     """Return printable text of at most `MAX_TEXT` characters: device strings may hold anything."""
     return "".join(c if c.isprintable() else " " for c in text)[:MAX_TEXT]
 
@@ -143,13 +143,17 @@ _TYPES: dict[Kind, tuple[ua.VariantType, int]] = {
     "time": (ua.VariantType.DateTime, ua.ObjectIds.UtcTime),
     "texts": (ua.VariantType.String, ua.ObjectIds.String),
     "times": (ua.VariantType.DateTime, ua.ObjectIds.UtcTime),
+    "localized": (ua.VariantType.LocalizedText, ua.ObjectIds.LocalizedText),
+    "node": (ua.VariantType.NodeId, ua.ObjectIds.NodeId),
 }
 
 
 ANY = PlantFacts("", "", datetime.fromtimestamp(0, UTC), None, None, (), (), (DeviceStatus(role="*", url="", state="not used yet"),))
 """A machine of which nothing is known: its picture holds the variables of the types."""
-RUNNING = ("Running", "Production/ActiveProgram/State/CurrentState", "Production/ActiveProgram/Name")
-"""A state of OPC 40501-1, the variable that holds it, and that of the program's name."""
+PROGRAM = "Production/ActiveProgram"
+"""The running program of a MachineToolType."""
+RUNNING = 5041
+"""Node id of the state Running of a program (MachineTool)."""
 
 
 class Space:
@@ -159,15 +163,14 @@ class Space:
         self._server, self._index, self._machine = server, index, machine
         self.types = types
         self._nodes: dict[str, Node] = {}
-        self._companion: dict[str, Node] = {}
         self._shown: Picture = {}
         self._stale = False
 
     @classmethod
-    async def built(cls, server: Server, index: int, machine: str) -> Space:
-        """Add the types and the machine; ``index``: index of Abbe's namespace."""
+    async def built(cls, server: Server, index: int, machine: str, *, companions: bool) -> Space:
+        """Add the types and the machine; ``index``: index of Abbe's namespace; other arguments and errors as for `add_types`."""
         variables = [(path, ua.NodeId(_TYPES[leaf.kind][1])) for path, leaf in picture_of(ANY).items()]
-        space = cls(server, index, machine, await add_types(server, index, variables))
+        space = cls(server, index, machine, await add_types(server, index, variables, companions=companions))
         await space._add_machine()
         return space
 
@@ -180,31 +183,32 @@ class Space:
         parent, kind = (self._server.get_node(one) for one in (self.types.parent, self.types.of("")))
         name = ua.QualifiedName(self._machine, self._index)
         (node, *_) = await instantiate(parent, kind, self._id(""), name, ua.LocalizedText(self._machine), instantiate_optional=False)
-        self._nodes[""] = node
-        self._companion = await variables_under(node)
-        for variable in self._companion.values():  # what the standard wants and Abbe does not know has no value
-            await self._server.write_attribute_value(variable.nodeid, _data(Leaf(None, "text"), datetime.now(UTC)))
+        self._nodes = {"": node} | await variables_under(node)
+        for path in self._nodes.keys() - {""}:  # what the standard wants and Abbe does not know has no value
+            self._shown[path] = Leaf(None, "text")
+            await self._server.write_attribute_value(self._nodes[path].nodeid, _data(self._shown[path], datetime.now(UTC)))
 
     async def show(self, picture: Picture, now: datetime) -> int:
         """Write changed values; return how many. Values missing from the picture become unknown."""
+        picture = {**picture, **self._program(picture)}
         gone = {path: Leaf(None, leaf.kind, leaf.unit) for path, leaf in self._shown.items() if path not in picture}
         changed = {path: leaf for path, leaf in {**picture, **gone}.items() if self._stale or self._shown.get(path) != leaf}
         for path, leaf in changed.items():
             node = self._nodes.get(path) or await self._make(path, leaf)
             await self._server.write_attribute_value(node.nodeid, _data(leaf, now))
         self._shown, self._stale = {**picture, **gone}, False
-        if self._companion:
-            await self._show_program(picture, now)
         return len(changed)
 
-    async def _show_program(self, picture: Picture, now: datetime) -> None:
-        """A running check is the machine's active program; other programs of the machine are not known."""
-        running, (state, at, name) = picture["Check/Active"].value, RUNNING
-        recipe = picture["Check/Recipe"]
-        await self._server.write_attribute_value(self._companion[name].nodeid, _data(recipe, now))
-        value = ua.Variant(ua.LocalizedText(state)) if running else ua.Variant(None, ua.VariantType.Null)
-        status = ua.StatusCode(ua.StatusCodes.Good if running else ua.StatusCodes.BadNoData)
-        await self._server.write_attribute_value(self._companion[at].nodeid, ua.DataValue(value, status, now, now))
+    def _program(self, picture: Picture) -> Picture:
+        """A running check is the machine's active program; what the machine runs otherwise is not known."""
+        if self.types.tools is None:
+            return {}
+        running = picture["Check/Active"].value
+        return {
+            f"{PROGRAM}/Name": picture["Check/Recipe"],
+            f"{PROGRAM}/State/CurrentState": Leaf("Running" if running else None, "localized"),
+            f"{PROGRAM}/State/CurrentState/Id": Leaf(ua.NodeId(RUNNING, self.types.tools) if running else None, "node"),
+        }
 
     async def show_stale(self, now: datetime) -> bool:
         """Mark every value as the last known one; return False if they were marked before."""
@@ -264,7 +268,8 @@ def _data(leaf: Leaf, now: datetime) -> ua.DataValue:
     variant, _ = _TYPES[leaf.kind]
     if leaf.value is None:
         return ua.DataValue(ua.Variant(None, ua.VariantType.Null), ua.StatusCode(ua.StatusCodes.BadNoData), now, now)
-    return ua.DataValue(ua.Variant(leaf.value, variant), ua.StatusCode(ua.StatusCodes.Good), now, now)
+    value = ua.LocalizedText(str(leaf.value)) if leaf.kind == "localized" else leaf.value
+    return ua.DataValue(ua.Variant(value, variant), ua.StatusCode(ua.StatusCodes.Good), now, now)
 
 
 def _engineering(unit: PlantUnit) -> ua.EUInformation:

@@ -2,7 +2,8 @@
 
 With the nodesets of DI, IA, Machinery (OPC 40001-1) and MachineTool (OPC 40501-1) at hand, the machine is a MachineToolType in the folder
 ``Machines``, and events are NotificationEventTypes. Without them the same types derive from those of the standard. An alarm is no
-AlertType: that is a condition which clients may acknowledge, and here nothing can be written. OPC 40210 has no public nodeset.
+AlertType: that is a condition which clients may acknowledge, and here nothing can be written. OPC 40210 is not used: no
+package holds its nodeset.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
+from xml.etree.ElementTree import ParseError
 
 from asyncua import Node, Server, ua
 
@@ -37,13 +39,13 @@ ALARM_FIELDS = (("Code", _TEXT), ("Device", _TEXT))
 
 @dataclass(frozen=True, slots=True)
 class Types:
-    """Types of one server, and where it shows the machine. ``companions``: they derive from the companion specifications."""
+    """Types of one server, and where it shows the machine. ``tools``: index of the companion specification's namespace, None without."""
 
     objects: dict[str, ua.NodeId]
     result_event: Node
     alarm_event: Node
     parent: ua.NodeId
-    companions: bool
+    tools: int | None
 
     def of(self, path: str) -> ua.NodeId:
         """Return the type of the object at ``path``."""
@@ -51,8 +53,13 @@ class Types:
         return self.objects.get(path) or self.objects.get(f"{above}/*") or ua.NodeId(ua.ObjectIds.FolderType)
 
 
-async def add_types(server: Server, index: int, variables: Iterable[tuple[str, ua.NodeId]]) -> Types:
-    """Add the companion specifications, if they are at hand, and Abbe's types.
+def has_companions() -> bool:
+    """Return whether the nodesets of the companion specifications are at hand."""
+    return all((NODESETS / name).is_file() for name in COMPANIONS)
+
+
+async def add_types(server: Server, index: int, variables: Iterable[tuple[str, ua.NodeId]], *, companions: bool) -> Types:
+    """Add the companion specifications, if they are wanted, and Abbe's types.
 
     Parameters
     ----------
@@ -60,13 +67,17 @@ async def add_types(server: Server, index: int, variables: Iterable[tuple[str, u
         The server; index of Abbe's namespace.
     variables : iterable of (path, data type)
         What the objects of the types hold.
+
+    Raises
+    ------
+    NodesetBroken
+        A companion specification cannot be read; the server is not to be used then.
     """
     nodes = server.nodes
     machine, event, parent = nodes.base_object_type, nodes.base_event_type, nodes.objects.nodeid
-    companions = all((NODESETS / name).is_file() for name in COMPANIONS)
+    tools = None
     if companions:
-        for name in COMPANIONS:
-            await server.import_xml(NODESETS / name)
+        await _import_companions(server)
         machinery, tools = [await server.get_namespace_index(uri) for uri in (MACHINERY, MACHINE_TOOL)]
         machine, event = (server.get_node(ua.NodeId(number, tools)) for number in (MACHINE_TOOL_TYPE, NOTIFICATION_EVENT_TYPE))
         parent = ua.NodeId(MACHINES, machinery)
@@ -76,13 +87,36 @@ async def add_types(server: Server, index: int, variables: Iterable[tuple[str, u
         if above in types:
             node = await types[above].add_variable(index, name, None, datatype=datatype)
             await node.set_modelling_rule(False)  # optional: what is not known is not there, or has no value
+    await _add_parts(types, index)
     return Types(
         {path: node.nodeid for path, node in types.items()},
         await server.create_custom_event_type(index, "CheckResultEventType", event.nodeid, list(RESULT_FIELDS)),
         await server.create_custom_event_type(index, "AlarmEventType", event.nodeid, list(ALARM_FIELDS)),
         parent,
-        companions,
+        tools,
     )
+
+
+class NodesetBroken(Exception):  # noqa: N818 - a state of a file
+    """A companion specification cannot be read."""
+
+
+async def _import_companions(server: Server) -> None:
+    for name in COMPANIONS:
+        try:
+            await server.import_xml(NODESETS / name)
+        except (ParseError, ValueError, LookupError, RuntimeError, OSError, ua.UaError) as error:
+            raise NodesetBroken(f"{name}: {type(error).__name__}: {error}") from error
+
+
+async def _add_parts(types: dict[str, Node], index: int) -> None:
+    """Declare the objects of a machine, all optional; ``Devices`` is a folder of connections."""
+    for path, kind in types.items():
+        if path and "/" not in path:
+            part = await types[""].add_object(index, path, kind.nodeid, instantiate_optional=False)
+            await part.set_modelling_rule(False)
+    devices = await types[""].add_folder(index, "Devices")
+    await devices.set_modelling_rule(False)
 
 
 async def variables_under(node: Node, path: str = "") -> dict[str, Node]:

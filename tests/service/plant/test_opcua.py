@@ -8,6 +8,8 @@ import socket
 from collections.abc import AsyncIterator, Iterator
 from contextlib import asynccontextmanager
 from copy import copy
+from dataclasses import replace
+from datetime import datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -23,10 +25,11 @@ from asyncua.server.address_space import NodeData, NodeManagementService
 from asyncua.server.standard_address_space import standard_address_space
 from asyncua.ua.uaerrors import UaStatusCodeError
 
-from abbe.service.clock import SystemClock
+from abbe.service.clock import Clock, SystemClock
 from abbe.service.config_schema import OpcUa
 from abbe.service.errors import ConfigError
 from abbe.service.plant.gather import PlantAlarm
+from abbe.service.plant.opcua import events as news
 from abbe.service.plant.opcua import server as served
 from abbe.service.plant.opcua import types
 from abbe.service.plant.opcua.server import OpcUaServer
@@ -38,13 +41,14 @@ from tests.service.plant.facts_for_tests import NOON, RUNNING, Source, check, fa
 BASE = "ns=2;s=mill-7"
 CLIENT_URI = "urn:plant:scada"
 DI = "http://opcfoundation.org/UA/DI/"
-ALARM = PlantAlarm("ALM-001", "body diagonal above its limit", NOON)
+ALARM = PlantAlarm("SCH-001", "weekly: the slot\x00 was missed", NOON + timedelta(hours=2))
+NEW = replace(check(3, "fail", straightness_um=4.0), started_utc=NOON + timedelta(hours=1))
 
 
 @asynccontextmanager
-async def running(setup: OpcUa, source: Source) -> AsyncIterator[OpcUaServer]:
+async def running(setup: OpcUa, source: Source, clock: Clock | None = None) -> AsyncIterator[OpcUaServer]:
     stop = asyncio.Event()
-    part = OpcUaServer(setup, source, SystemClock(), "mill-7", "0.1.0")
+    part = OpcUaServer(setup, source, clock or SystemClock(), "mill-7", "0.1.0")
     task = asyncio.create_task(part.run(stop))
     heard = asyncio.create_task(part.listening.wait())
     try:
@@ -201,12 +205,20 @@ async def test_a_client_knows_the_machine_by_its_types(source: Source, companion
         declared = {(await one.read_browse_name()).Name for one in await client.get_node(await type_of(client, "Check")).get_children()}
         shown = {(await one.read_browse_name()).Name for one in await client.get_node(f"{BASE}/Check").get_children()}
         assert declared == shown
+        parts = {(await one.read_browse_name()).Name for one in await kind.get_children()}
+        assert {"State", "Check", "LastResult", "Alarms", "CompensationTable", "Devices"} <= parts
         if companions:
             uris = [await client.get_namespace_index(uri) for uri in (DI, types.MACHINE_TOOL)]
             program = await machine.get_child([f"{uris[1]}:Production", f"{uris[1]}:ActiveProgram", f"{uris[1]}:Name"])
             serial = await machine.get_child([f"{uris[0]}:Identification", f"{uris[0]}:SerialNumber"])
-            assert await program.read_value() == "quick-check"
+            state = await machine.get_child([*(f"{uris[1]}:{name}" for name in ("Production", "ActiveProgram", "State")), "0:CurrentState"])
+            at = await client.get_node(await (await state.get_child("0:Id")).read_value()).read_browse_name()
+            assert (await program.read_value(), (await state.read_value()).Text, at.Name) == ("quick-check", "Running", "Running")
             assert (await serial.read_data_value(raise_on_bad_status=False)).StatusCode.name == "BadNoData", "not known, so not invented"
+            source.now = None
+            await source.asked_again()
+            stale = await program.read_data_value(raise_on_bad_status=False)
+            assert stale.StatusCode.name == "UncertainLastUsableValue"
 
 
 async def type_of(client: Client, path: str) -> ua.NodeId:
@@ -215,6 +227,35 @@ async def type_of(client: Client, path: str) -> ua.NodeId:
 
 async def type_name(client: Client, path: str) -> str:
     return (await client.get_node(await type_of(client, path)).read_browse_name()).Name
+
+
+class AtNoon(SystemClock):
+    """The server began before what is new."""
+
+    def utc(self) -> datetime:
+        return NOON
+
+
+def test_what_comes_back_into_a_full_list_is_no_news() -> None:
+    """Facts hold the newest twenty alarms and ten checks: when one leaves them, an older one returns."""
+    old = [PlantAlarm("SCH-001", f"slot {k}", NOON - timedelta(days=20 - k)) for k in range(20)]
+    new = news.News(NOON)
+    assert new.alarms(facts(alarms=tuple(reversed(old[1:])))) == []
+    assert new.alarms(facts(alarms=tuple(reversed(old)))) == []
+    twins = tuple(replace(ALARM, text=f"twin {k}") for k in (2, 1))
+    assert [one.text for one in new.alarms(facts(alarms=twins[1:]))] == ["twin 1"]
+    assert [one.text for one in new.alarms(facts(alarms=twins))] == ["twin 2"]
+    assert new.checks(facts(checks=(check(2),))) == []
+    assert [one.id for one in new.checks(facts(checks=(NEW, check(2), check(1))))] == [3]
+    assert new.checks(facts(checks=(NEW, check(2)))) == []
+
+
+async def test_a_damaged_nodeset_is_left_out(source: Source, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    for name in types.COMPANIONS:
+        (tmp_path / name).write_text("<UANodeSet")
+    monkeypatch.setattr(types, "NODESETS", tmp_path)
+    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
+        assert await value(client, "State") == "idle"
 
 
 class Heard:
@@ -233,18 +274,21 @@ class Heard:
 
 @pytest.mark.parametrize("emitter", ["i=2253", BASE], ids=["at the server", "at the machine"])
 async def test_a_check_that_ended_and_a_new_alarm_are_events(source: Source, companions: bool, emitter: str) -> None:
-    async with running(OpcUa(port=0), source) as part, client_of(part) as client:
+    async with running(OpcUa(port=0), source, AtNoon()) as part, client_of(part) as client:
         heard = Heard()
         subscription = await client.create_subscription(20, heard)
         kinds = [one for path in ("CheckResultEventType", "AlarmEventType") for one in [await event_type(client, path, companions)]]
         await subscription.subscribe_events(client.get_node(emitter), kinds)
         await source.asked_again()
         assert heard.events.empty(), "what was known at the start is no news"
-        source.now = facts(checks=(check(3, "fail", straightness_um=4.0), check(2, "fail")), alarms=(ALARM, *facts().alarms))
+        source.now = facts(checks=(NEW, check(2, "fail")), alarms=(ALARM, *facts().alarms))
         result, alarm = await heard.next(), await heard.next()
         assert (result.Number, result.Verdict, result.Recipe, result.Severity) == (3, "fail", "quick-check", 800)
         assert (json.loads(result.Figures), result.Message.Text) == ({"straightness_um": [4.0, 1.1, 20.0]}, "check 3: fail")
-        assert (alarm.Code, alarm.Message.Text, alarm.SourceName) == ("ALM-001", "body diagonal above its limit", "mill-7")
+        assert (alarm.Code, alarm.Message.Text, alarm.SourceName) == ("SCH-001", "weekly: the slot  was missed", "mill-7")
+        assert (alarm.Time, result.Time) == (ALARM.at_utc, NEW.started_utc + timedelta(seconds=61))
+        if companions:
+            assert (result.Identifier, alarm.Identifier) == ("check 3", "SCH-001")
         await source.asked_again()
         assert heard.events.empty(), "each once"
 

@@ -245,8 +245,15 @@ def test_every_figure_is_in_qif_with_u_unit_limit_and_status() -> None:
     others = {one.get("name"): one.get("value") for one in root.iter(f"{QIF}AttributeStr")}
     assert others[f"{GROUP}: R"] == "not observable"
     assert others["Ball-bar <XY> & \ufffd: AF_SQUARENESS"] == "-18.2 µm/m; U is not known"
+    assert (others["Machine"], others["Measured"]) == ("Fräse <7>", "2026-11-22 to 2026-11-23")
     numbers = [int(one.get("id")) for one in root.iter() if one.get("id")]
     assert (len(set(numbers)), int(root.get("idMax"))) == (len(numbers), max(numbers))
+    beyond = ReportFigure("g", "t", "n", 1.0, 0.1, "", limit=float("nan"))
+    odd = [ReportFigure("g\x07", "s", "n", 1.0, 1e-13, "\x07", limit=1.0), beyond]
+    root = etree.fromstring(document_qif(replace(DOCUMENT, figures=odd, conditions={"a\x07": "b\ud800"})).encode())
+    (value,) = root.iter(f"{QIF}Value")
+    assert (value.get("unitName"), value.get("combinedUncertainty")) == ("\ufffd", None)
+    assert document_qif(replace(DOCUMENT, issued="2026-11-27")) == document_qif(replace(DOCUMENT, issued="2026-11-28"))
     with pytest.raises(FileFormatError, match="QIF holds figures"):
         document_qif(replace(DOCUMENT, figures=[]))
 
