@@ -65,7 +65,8 @@ class Events:
             for generator in generators[-1]:
                 generator.event.SourceNode, generator.event.SourceName = machine.nodeid, name
                 generator.event.data_types["Identifier"] = ua.VariantType.String  # the nodeset gives it no value, so asyncua no type
-        return cls(*generators, News(since))
+        results, alarms = generators
+        return cls(results, alarms, News(since))
 
     async def show(self, facts: PlantFacts) -> None:
         """Emit what is new since the last call."""

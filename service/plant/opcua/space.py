@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal
+from typing import Literal, TypeAlias
 
 from asyncua import Node, Server, ua
 from asyncua.common.instantiate_util import instantiate
@@ -15,7 +15,7 @@ from abbe.service.domain.verification import Verification
 from abbe.service.plant.gather import PlantAlarm, PlantFacts, PlantUnit, unit_of
 from abbe.service.plant.opcua.types import Types, add_types, variables_under
 
-Value = str | bool | int | float | datetime | list[str] | list[datetime] | ua.NodeId | None
+Value: TypeAlias = str | bool | int | float | datetime | list[str] | list[datetime] | ua.NodeId | None
 Kind = Literal["text", "flag", "count", "real", "time", "texts", "times", "localized", "node"]
 PAST_CHECKS = 10
 MAX_TEXT = 500
