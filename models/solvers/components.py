@@ -280,7 +280,7 @@ def _inward(gradient: F1, info: F2, c: Components, model: SizeModel) -> F1:
 
 
 def _bounds(c: Components, model: SizeModel) -> tuple[F1, F1]:
-    return np.concatenate([model.low, LEAST_ETA]), np.concatenate([model.high, np.full(c.eta.size, np.inf)])
+    return np.concatenate([model.low, LEAST_ETA[: c.eta.size]]), np.concatenate([model.high, np.full(c.eta.size, np.inf)])
 
 
 def _positive(info: F2, least: float) -> F2:
@@ -299,18 +299,13 @@ def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tu
     """`estimate`, including the correlation length of the error motions and the share of their variance at the ends of the strokes.
 
     The smaller share is taken only if the log evidence gains `CLEAR`: without readings near the ends, a share that is too small costs
-    more than one that is too large. It is tried at other lengths only if it gains at the best length of the usual share.
-    ``sums`` are those of the unknowns in units of their typical size.
+    more than one that is too large. ``sums`` are those of the unknowns in units of their typical size.
     """
     usual, least = ENDS_SHARES
     best = _fit_length(sums, with_shapes(model, model.length, usual), start)
     if not model.blocks:
         return best
-    fewer = with_shapes(model, best[0].length, least)
-    found = estimate(sums.turned(fewer.root, fewer.turned), fewer, best[1].components)
-    if found.value <= best[1].value:
-        return best
-    other = _fit_length(sums, fewer, found.components)
+    other = _fit_length(sums, with_shapes(model, best[0].length, least), best[1].components)
     return other if other[1].value > best[1].value + CLEAR else best
 
 
