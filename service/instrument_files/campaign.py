@@ -129,7 +129,10 @@ def _columns(test: AxisReadings) -> dict[str, F1]:
     n = test.position_mm.size
     targets = np.unique(test.position_mm)
     if targets.size > 1 and np.diff(targets).min() < NEAREST_MM:
-        raise FileFormatError(f"targets are closer than {NEAREST_MM:g} mm: they would count as one", "leave out every second target")
+        raise FileFormatError(
+            f"targets are closer than {NEAREST_MM:g} mm: they would count as one",
+            "is the unit of the targets right? Else leave out every second target",
+        )
     zero = np.zeros(n)
     places = {place: test.position_mm if place == f"{test.axis.lower()}_mm" else zero for place in PLACES}
     return {

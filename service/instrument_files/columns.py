@@ -213,6 +213,10 @@ def _text(cell: Any) -> str:
     return repr(cell) if isinstance(cell, float) else str(cell).strip()
 
 
+POSITIONS_SHARE = 0.1
+"""Deviations that differ from their targets by less than this share of the stroke are positions."""
+
+
 @dataclass(frozen=True, slots=True)
 class _ReadingRows:
     """The rows of readings of a table, its headings, and the meaning of its columns."""
@@ -321,6 +325,9 @@ def _deviations(body: _ReadingRows, position: F1) -> tuple[F1, float, str]:
         value = value - value[0]
     elif name == "measured":
         value = value - position
+    elif one.unit in LENGTHS and np.ptp(position) > 0.0 and np.abs(value - position).max() < POSITIONS_SHARE * np.ptp(position):
+        far = int(np.abs(position).argmax())
+        raise body.wrong(far, f"the deviations follow the targets ({value[far]:g} mm at {position[far]:g} mm): is the column [measured]?")
     return value, step_of(words, unit), "angle" if one.unit in ANGLES else "length"
 
 

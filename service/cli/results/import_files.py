@@ -69,6 +69,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     """
     from abbe.service.instrument_files.answers import Answers
     from abbe.service.instrument_files.point_list import is_point_list
+    from abbe.service.instrument_files.registry import read_file
 
     if all(is_point_list(path) for path in files):
         _import_points(files, name or files[0].stem, (db, machine), as_json=as_json)
@@ -79,7 +80,14 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     answers = Answers(
         axis=axis, unit=unit, sign=sign, at_mm=at_mm, scale_c=scale_c, air_c=air_c, pressure_hpa=pressure_hpa, feed_mm_min=feed_mm_min
     )
-    _import_files(files, columns, answers, name or files[0].stem, (db, machine), yes=yes, as_json=as_json)
+    given = {
+        "--name": name, "--columns": columns, "--axis": axis, "--unit": unit, "--sign": sign, "--at": at_mm, "--scale-temperature": scale_c,
+        "--air-temperature": air_c, "--air-pressure": pressure_hpa, "--feed": feed_mm_min,
+    }  # fmt: skip
+    again = [part for option, value in given.items() if value is not None for part in (option, quote(str(value)))]
+    command = " ".join(["abbe import", *(quote(str(path)) for path in files), *again, "--yes"])
+    contents = [read_file(path, _columns(path, columns)) for path in files]
+    _import_contents(contents, answers, name or files[0].stem, (db, machine), command, yes=yes, as_json=as_json)
 
 
 def _import_points(files: list[Path], name: str, where: tuple[str | None, Path | None], *, as_json: bool) -> None:
@@ -114,12 +122,12 @@ def _said(campaign: str, runs: int, url: str, *, beside: int = 0, as_json: bool)
     answer(doc, f"imported campaign {campaign!r} with {runs} runs{more} into {url}", as_json=as_json)
 
 
-def _import_files(
-    files: list[Path],
-    columns: Path | None,
+def _import_contents(
+    contents: list[Content],
     answers: Answers,
     name: str,
     where: tuple[str | None, Path | None],
+    command: str,
     *,
     yes: bool,
     as_json: bool,
@@ -127,14 +135,12 @@ def _import_files(
     from abbe.service.config import load_machine
     from abbe.service.instrument_files.answers import checked
     from abbe.service.instrument_files.campaign import campaign_of
-    from abbe.service.instrument_files.registry import read_file
     from abbe.service.runs.exchange import store_folder
     from abbe.service.site import site_of
 
     db, machine = where
     file = machine if db is not None else named_machine(machine)
     site = None if file is None else site_of(load_machine(file).machine)
-    contents = [read_file(path, _columns(path, columns)) for path in files]
     answers = _asked(contents, checked(answers))
     made = campaign_of(contents, answers, name, None if site is None else site.doc)
     if not as_json:
@@ -142,7 +148,7 @@ def _import_files(
     if not yes and not (sys.stdin.isatty() and typer.confirm("Store this campaign?")):
         text = "nothing was stored" + ("" if sys.stdin.isatty() else ": --yes stores it")
         answer({"campaign": None, "runs": 0, "text": text}, text, as_json=as_json)
-        conclude(f"abbe import {' '.join(quote(str(path)) for path in files)} --yes", machine=machine, db=db, as_json=as_json)
+        conclude(command, machine=machine, db=db, as_json=as_json)
         raise typer.Exit(NOT_STORED)
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(store_folder(store, made.folder))

@@ -99,7 +99,7 @@ def test_an_existing_database_is_only_put_aside_when_asked(shop: Shop, made: Pat
     with Store.open(shop.url) as store:
         store.verifications.add(1, None, "pass", {"late": True})
     assert run(["restore", "-m", str(shop.machine), str(made)]) == 2
-    assert "exists - give --replace" in capsys.readouterr().err
+    assert "exists - add --replace" in capsys.readouterr().err
     assert run(["restore", "-m", str(shop.machine), str(made), "--replace", "--json"]) == 0
     aside = [Path(name) for name in json.loads(capsys.readouterr().out)["aside"]]
     old = next(path for path in aside if path.name.startswith("abbe.sqlite3.replaced-") and not path.name.endswith("-journal"))

@@ -204,7 +204,9 @@ def test_a_laser_file_becomes_a_certificate_and_a_file_for_statistics(abbe: Abbe
     Path("mill.toml").write_text(MACHINE_FILE + issuer)
     abbe("import", "x.rtl", "--yes", "--machine", "mill.toml")
     assert "when it was measured, which is not on record" in abbe.fails("report", "x", "--machine", "mill.toml", "--out", "x.xml")
-    assert "--measured-on is '22.11.2026', no day" in abbe.fails("report", "x", "--machine", "mill.toml", "--measured-on", "22.11.2026")
+    assert "--measured-on is '22.11.2026', expected a day" in abbe.fails(
+        "report", "x", "--machine", "mill.toml", "--measured-on", "22.11.2026"
+    )
     done = abbe("report", "x", "--machine", "mill.toml", "--measured-on", "2026-11-22", "--out", "x.xml", "--out", "x.dfq")
     assert done.code == 0, done.err
     root = ET.parse("x.xml").getroot()

@@ -185,6 +185,7 @@ WRONG = {
         "columns.toml: target.unit is 'furlong', expected one",
     ),
     "both": (TABLE, COLUMNS + '[deviation]\ncolumn = 1\nunit = "mm"\n', "columns.toml: expected either measured (positions) or deviation"),
+    "positions": (TABLE, COLUMNS.replace("[measured]", "[deviation]"), "t.csv:5: the deviations follow the targets (199.989 mm at 200 mm)"),
     "unknown key": (TABLE, 'axes = "X"\n' + COLUMNS, "columns.toml: axes: Extra inputs are not permitted"),
 }
 
