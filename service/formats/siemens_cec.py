@@ -3,10 +3,10 @@
 If the two directions differ, there are two tables, with $AN_CEC_DIRECTION 1 and -1. For a product, $AN_CEC_MULT_BY_TABLE[t] = n multiplies
 table t by table n (index n - 1). As in the manual's grid example (6FC5397-1BP40-3BA1 p. 259), only the product acts; the factor table by
 itself is switched off ($SN_CEC_TABLE_ENABLE = 0). This is untested on a control: verify the 10 µm step first (docs/reference/formats.md).
-The sign is in no manual. Two public writers, apparently of one builder (rotary tables, both directions), write measured - nominal, +e; we
-write −e because the sum is added to the setpoint. The measured step decides:
-``--step-moved 10`` turns the sign. Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables are looked up at the
-command.
+The sign is in no manual. Two public writers (files 51872898796 and 51984388978 of a public index of source code, apparently of one French
+builder; rotary tables, both directions) write measured - nominal, +e; we write −e because the sum is added to the setpoint. The measured
+step decides: ``--step-moved 10`` turns the sign. Load with MD32710 = 0. The input is the SETPOINT of the base axis, so tables
+are looked up at the command.
 """
 
 from __future__ import annotations

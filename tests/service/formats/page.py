@@ -34,7 +34,8 @@ no manual states it; `--step-moved -10` records that the sign is confirmed. By a
 |---|---|---|---|---|
 """
 _CEC = """
-Siemens CEC: two public tools of rotary tables, apparently of one builder, write +e; no manual states the sign.
+Siemens CEC: two public tools of rotary tables (files 51872898796 and 51984388978 of a public index of source code, apparently of one French
+builder) write +e; no manual states the sign.
 """
 _CONTROLS = """
 ## Controls
