@@ -77,7 +77,7 @@ def test_a_stop_in_the_middle_of_a_push(tmp_path: Path, open_: bool) -> None:
             sims.ask("reset")
         with closing(start(tmp_path, sims)) as again:
             if open_:
-                assert "the old table was made active again" in again.expect("is closed")
+                assert "the old table was made active again" in again.expect("open pushes are closed")
                 # the desk's next look: half a minute
                 again.expect("proposal 4 rolled back")
             if not open_:

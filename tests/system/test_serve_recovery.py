@@ -80,7 +80,7 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
 
         machine.file.write_text(good.replace(cnc, f"modbus+tcp://127.0.0.1:{free_port()}"))
         with closing(abbe("serve", "-m", machine.file)) as away:
-            away.expect("cannot be closed")
+            away.expect("open pushes remain open")
             away.expect('"page up"')
             with httpx.Client(base_url=f"http://127.0.0.1:{port}", timeout=30) as http:
                 (told,) = http.get("/api/v1/status").json()["attention"]
@@ -96,14 +96,14 @@ def test_an_open_push_is_an_alarm_until_the_controller_is_back(tmp_path: Path) -
 
         machine.file.write_text(good)
         with closing(abbe("serve", "-m", machine.file)) as back:
-            assert "the old table was made active again" in back.expect("is closed")
+            assert "the old table was made active again" in back.expect("open pushes are closed")
             back.expect('"page up"')
             assert httpx.get(f"http://127.0.0.1:{port}/api/v1/status", timeout=30).json()["attention"] == []
             assert asyncio.run(table_in_force(cnc))[1] == before[1]
             if LONG:  # another one is killed beside the running service, which does not wait for its next check
                 killed = subprocess.run([sys.executable, "-c", KILLED, words], check=False, capture_output=True, text=True)
                 assert killed.returncode == -signal.SIGKILL, killed.stderr
-                assert "the old table was made active again" in back.expect("is closed", patience_s=60.0)
+                assert "the old table was made active again" in back.expect("open pushes are closed", patience_s=60.0)
                 assert asyncio.run(table_in_force(cnc))[1] == before[1]
             asyncio.run(put_in_force(cnc))
             back.expect(
