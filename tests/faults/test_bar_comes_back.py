@@ -167,7 +167,7 @@ async def test_a_box_that_is_lost_again_and_again_is_left_to_a_person() -> None:
     breaks = BarBreaks(session, Control(), GOES_ON)
     for _ in range(MOST_BREAKS):
         runner = Runner(session)
-        with pytest.raises(RunInterrupted, match="is back"):
+        with pytest.raises(RunInterrupted, match="was lost and restored"):
             await breaks.wait(Rebooted("bar", "stream", "anew"), runner, NoJournal())
         assert runner.touched
     await breaks.wait(Rebooted("bar", "stream", "anew"), Runner(session), NoJournal())
