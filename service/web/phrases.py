@@ -1,7 +1,7 @@
 """Sentences that others have written in English (stored verdicts and remarks, reports, pictures), in the reader's language.
 
-A phrase file maps English patterns to the language: ``"{n} runs"`` fits "17 runs", and what stands in the braces is told by the same
-rules; a place with a name of one letter holds no blanks. A text without a pattern stays as it is, so that nothing is lost; a test walks
+A phrase file maps English patterns to the language: ``"{n} runs"`` fits "17 runs", and the same rules translate what stands in the
+braces; a place with a name of one letter holds no blanks. A text without a pattern stays as it is, so that nothing is lost; a test walks
 all screens and finds what has none.
 """
 

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from datetime import datetime, timedelta
+from datetime import UTC, datetime, timedelta
 
 from asyncua import Node, Server, ua
 from asyncua.server.event_generator import EventGenerator
 
 from abbe.service.domain.verification import Verification
-from abbe.service.plant.gather import PlantAlarm, PlantFacts
+from abbe.service.plant.gather import SHOWN_ALARMS, PlantAlarm, PlantFacts
 from abbe.service.plant.opcua.space import short_text
 from abbe.service.plant.opcua.types import Types
 
@@ -19,14 +19,18 @@ SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 
 
 class News:
-    """Tells the checks and alarms that were not shown before. Facts hold the newest only, so times and numbers decide, not the lists.
+    """Finds the checks and alarms that were not shown before.
 
-    ``since``: what ended or rose before is not new.
+    Facts hold the newest alarms only: when one leaves a full list, an older one returns, which is not new. The alarm of a check has the
+    time at which the check began, so a later one may have been shown before it.
+
+    ``since``: what ended or rose before the first facts and this time is not new.
     """
 
     def __init__(self, since: datetime) -> None:
         self._since, self._check = since, -1
-        self._alarm_utc, self._at_that_time = since, frozenset[PlantAlarm]()
+        self._shown: frozenset[PlantAlarm] | None = None
+        self._oldest_utc = datetime.min.replace(tzinfo=UTC)
 
     def checks(self, facts: PlantFacts) -> list[Verification]:
         """Return the new checks, oldest first."""
@@ -37,15 +41,13 @@ class News:
 
     def alarms(self, facts: PlantFacts) -> list[PlantAlarm]:
         """Return the new alarms, oldest first."""
-        new = [
-            one
-            for one in reversed(facts.alarms)
-            if one.at_utc > self._alarm_utc or (one.at_utc == self._alarm_utc and one not in self._at_that_time)
-        ]
-        if new:
-            newest = max(one.at_utc for one in new)
-            before = self._at_that_time if newest == self._alarm_utc else frozenset()
-            self._alarm_utc, self._at_that_time = newest, before | {one for one in new if one.at_utc == newest}
+        shown = self._shown
+        if shown is None:
+            shown = frozenset(one for one in facts.alarms if one.at_utc <= self._since)
+        new = [one for one in reversed(facts.alarms) if one not in shown and one.at_utc > self._oldest_utc]
+        if len(facts.alarms) >= SHOWN_ALARMS:
+            self._oldest_utc = facts.alarms[-1].at_utc
+        self._shown = frozenset(one for one in (*shown, *facts.alarms) if one.at_utc >= self._oldest_utc)
         return new
 
 

@@ -238,16 +238,24 @@ class AtNoon(SystemClock):
 
 def test_what_comes_back_into_a_full_list_is_no_news() -> None:
     """Facts hold the newest twenty alarms and ten checks: when one leaves them, an older one returns."""
-    old = [PlantAlarm("SCH-001", f"slot {k}", NOON - timedelta(days=20 - k)) for k in range(20)]
+    alarms = [PlantAlarm("SCH-001", f"slot {k}", NOON - timedelta(days=k)) for k in range(21)]  # newest first
     new = news.News(NOON)
-    assert new.alarms(facts(alarms=tuple(reversed(old[1:])))) == []
-    assert new.alarms(facts(alarms=tuple(reversed(old)))) == []
+    assert new.alarms(facts(alarms=tuple(alarms[:20]))) == []
+    assert new.alarms(facts(alarms=tuple(alarms[1:]))) == []
     twins = tuple(replace(ALARM, text=f"twin {k}") for k in (2, 1))
-    assert [one.text for one in new.alarms(facts(alarms=twins[1:]))] == ["twin 1"]
-    assert [one.text for one in new.alarms(facts(alarms=twins))] == ["twin 2"]
+    assert [one.text for one in new.alarms(facts(alarms=(*twins[1:], *alarms[:19])))] == ["twin 1"]
+    assert [one.text for one in new.alarms(facts(alarms=(*twins, *alarms[:18])))] == ["twin 2"]
     assert new.checks(facts(checks=(check(2),))) == []
     assert [one.id for one in new.checks(facts(checks=(NEW, check(2), check(1))))] == [3]
     assert new.checks(facts(checks=(NEW, check(2)))) == []
+
+
+def test_the_alarm_of_a_check_is_new_though_the_check_began_before_another_alarm() -> None:
+    new, began = news.News(NOON), PlantAlarm("DRV-002", "the check failed", NOON - timedelta(minutes=5))
+    assert new.alarms(facts(alarms=())) == []
+    assert new.alarms(facts(alarms=(ALARM,))) == [ALARM]
+    assert new.alarms(facts(alarms=(ALARM, began))) == [began]
+    assert new.alarms(facts(alarms=(ALARM, began))) == []
 
 
 async def test_a_damaged_nodeset_is_left_out(source: Source, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
