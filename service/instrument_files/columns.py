@@ -388,6 +388,14 @@ def _further(body: _ReadingRows) -> dict[str, F1]:
     return out
 
 
+_DECIMAL_COMMA = re.compile(rb"(?:^|[;\t ])\s*[-+]?\d+,\d+\s*(?:[;\t ]|$)", re.MULTILINE)
+
+
+def has_decimal_commas(data: bytes) -> bool:
+    """Whether a text table holds numbers with a comma between other delimiters, like ``50,25;``."""
+    return _DECIMAL_COMMA.search(data) is not None
+
+
 def guesses(headings: Sequence[str]) -> Iterator[tuple[str, str]]:
     """Guess the heading of each column of a `ColumnFile` by common words."""
     words = {

@@ -178,7 +178,7 @@ def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
 def _columns_asked(path: Path) -> ColumnFile:
     """Ask for heading, axis, columns and units of a table."""
     from abbe.service.instrument_files.answers import ANGLES, LENGTHS
-    from abbe.service.instrument_files.columns import TIMES, ColumnFile, guesses
+    from abbe.service.instrument_files.columns import TIMES, ColumnFile, guesses, has_decimal_commas
     from abbe.service.instrument_files.registry import headings_of
 
     heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=1, err=True)
@@ -190,7 +190,10 @@ def _columns_asked(path: Path) -> ColumnFile:
         unit = {"unit": _choice("its unit", units, usual)} if units else {}
         return {"column": found if heading else int(found)} | unit
 
-    doc: dict[str, Any] = {"heading": heading, "axis": _choice("which axis was measured", ("X", "Y", "Z"))}
+    decimal = "."
+    if has_decimal_commas(path.read_bytes()) and typer.confirm("are commas the decimal signs?", default=True, err=True):
+        decimal = ","
+    doc: dict[str, Any] = {"heading": heading, "decimal": decimal, "axis": _choice("which axis was measured", ("X", "Y", "Z"))}
     moves = typer.confirm("did it move from target to target (no: it stood still)?", default=True, err=True)
     if moves:
         doc["target"] = column("the targets", "target", list(LENGTHS), "mm")

@@ -217,9 +217,9 @@ def test_a_laser_file_becomes_a_certificate_and_a_file_for_statistics(abbe: Abbe
 
 
 def test_a_person_is_asked_at_the_terminal(tmp_path: Path) -> None:
-    """Columns, units, axis and whether to store; the answers are kept beside the table, so that the next one needs none."""
-    Path("t.csv").write_text(TABLE.replace(",", "."))
-    answers = ["2", "X", "y", "Target", "mm", "measured", "Reading", "mm", "y", "+", "-", "Dir", "y"]
+    """Decimal sign, columns, units, axis and whether to store; the answers are kept beside the table, so that the next one needs none."""
+    Path("t.csv").write_text(TABLE)
+    answers = ["2", "y", "X", "y", "Target", "mm", "measured", "Reading", "mm", "y", "+", "-", "Dir", "y"]
     master, slave = pty.openpty()
     os.write(master, "".join(f"{one}\n" for one in answers).encode())
     command = [str(Path(sys.executable).with_name("abbe")), "import", "t.csv"]
