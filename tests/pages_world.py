@@ -40,11 +40,11 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
-from abbe.service.scheduler import record
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.users.people import Passwords, UserAccounts
+from abbe.service.verification import verify
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.core_link.logtail import LogTail
@@ -148,10 +148,10 @@ def _checks(store: Store, site: Site, schedule: Schedule, count: int, evil: str,
     now, number = datetime.now(UTC), store.machines.add(machine, site.doc)
     for week in range(count):
         at = now - timedelta(days=7 * (count - 1 - week), hours=3)
-        occasion = record.Occasion(machine, schedule, at)
+        occasion = verify.Occasion(machine, schedule, at)
         if week == count - 3:
             trouble = LinkDown(f"modbus+tcp://127.0.0.1:5021{evil}", "connect", f"refused{evil}", f"is the laser on?{evil}")
-            store.verifications.add_with_messages(number, record.failed_doc(occasion, trouble, at, 5.0), [])
+            store.verifications.add_with_messages(number, verify.failed_doc(occasion, trouble, at, 5.0), [])
             continue
         drift = 11.0 + 0.02 * week**2
         verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
@@ -160,7 +160,7 @@ def _checks(store: Store, site: Site, schedule: Schedule, count: int, evil: str,
                       campaign=f"quick-check {week}{evil}")  # fmt: skip
         if week in {count - 5, count - 1}:
             told = replace(told, campaign=known.campaign, run_labels=tuple(known.labels))
-        store.verifications.add_with_messages(number, record.check_doc(occasion, told), [])
+        store.verifications.add_with_messages(number, verify.check_doc(occasion, told), [])
 
 
 def add_alarms(store: Store, machine: str, schedule: Schedule, proposal: int, evil: str = "") -> None:

@@ -7,7 +7,7 @@ from abbe.drivers.registry import open_controller
 from abbe.service.compensation.commission import KIND
 from abbe.service.compensation.proved_levels import KIND as LEVELS
 from abbe.service.compensation.proved_levels import flags_of, identity
-from abbe.service.push.capabilities import Capabilities
+from abbe.service.push.journal import Capabilities
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

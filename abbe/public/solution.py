@@ -17,10 +17,9 @@ from abbe.public.estimates import Estimate
 from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.errors import TableRefused
-from abbe.service.identification.effect_removal import remove_effects
+from abbe.service.identification.removal import campaign_table, remove_effects, table_line
 from abbe.service.identification.solve import ProgressText, solve_runs
 from abbe.service.identification.solve_report import Assessment, assess, solution_of, solution_verdict
-from abbe.service.identification.table_removal import campaign_table, table_line
 from abbe.service.rendering.document_page import write_document
 from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.tables import motion_bands

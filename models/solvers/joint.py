@@ -118,6 +118,16 @@ class JointSolution:
     table_factor: F2 | None = None
 
     @property
+    def has_artefacts(self) -> bool:
+        """Whether some of its readings are points of artefacts."""
+        return any(run.kind == "artefact" for run in self.data)
+
+    @property
+    def only_artefacts(self) -> bool:
+        """Whether all its readings are points of artefacts."""
+        return all(run.kind == "artefact" for run in self.data)
+
+    @property
     def coefficients(self) -> F1:
         """Coefficients of the smooth terms, shape (len(terms),)."""
         return self.estimate.theta[: len(self.terms)]

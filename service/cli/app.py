@@ -11,9 +11,9 @@ from abbe.service.cli.administration.serve import serve
 from abbe.service.cli.administration.setting_up import doctor, init
 from abbe.service.cli.administration.system import SIM_SETTINGS, check_config, schema, sim, version
 from abbe.service.cli.administration.user import key, user
+from abbe.service.cli.common import CORRECT, MANAGE, MEASURE, UNDERSTAND, WATCH, give_form
 from abbe.service.cli.demo import demo
 from abbe.service.cli.device import device
-from abbe.service.cli.form import CORRECT, MANAGE, MEASURE, UNDERSTAND, WATCH, give_form
 from abbe.service.cli.measure import correct, listen, measure
 from abbe.service.cli.plan import plan
 from abbe.service.cli.reference import papers, vectors

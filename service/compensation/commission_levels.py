@@ -24,7 +24,7 @@ from abbe.service.compensation.proved_levels import KIND, flags_of, identity, la
 from abbe.service.compensation.recover import recover
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableMismatch, TableRefused, UnsafeToMove
-from abbe.service.push.capabilities import Capabilities
+from abbe.service.push.journal import Capabilities
 from abbe.service.sequences.control import tripped
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

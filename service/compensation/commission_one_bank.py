@@ -16,7 +16,7 @@ from abbe.service.compensation.commission_levels import FlagObservation, ProvedL
 from abbe.service.compensation.proved_levels import flags_of, identity
 from abbe.service.compensation.recover import recover
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.push.capabilities import Capabilities
+from abbe.service.push.journal import Capabilities
 from abbe.service.sequences.control import check_interlocks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

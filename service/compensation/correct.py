@@ -31,8 +31,8 @@ from abbe.service.compensation.pushing import Pushing, PushResult, Questions, Wa
 from abbe.service.domain.progress import Progress
 from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, TableRefused, TakenBack
+from abbe.service.identification.removal import removed_table, subtract_table
 from abbe.service.identification.solve import Solved, helix_misfit
-from abbe.service.identification.table_removal import removed_table, subtract_table
 from abbe.service.push.operations import VerificationResult
 from abbe.service.push.validate import drift_reason
 from abbe.service.runs.observations import run_data

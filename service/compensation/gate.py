@@ -28,7 +28,7 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.errors import TableRefused
-from abbe.service.push.capabilities import Capabilities
+from abbe.service.push.journal import Capabilities
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import (
     Candidate,
@@ -184,7 +184,7 @@ class PushContext:
 class Admission:
     """The token that a push needs: a proposal with no reason against it, and the readings and decisions that prove this.
 
-    ``level``: of the control (`abbe.service.push.capabilities`). ``hint``: a warning about the control for people, or empty.
+    ``level``: of the control (`abbe.service.push.journal`). ``hint``: a warning about the control for people, or empty.
     """
 
     precheck: PushPrecheck

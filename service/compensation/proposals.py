@@ -32,12 +32,11 @@ from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts, touched_boxes_mm, unsensed_axis
-from abbe.service.identification.effect_removal import RemovedEffects, remove_effects
+from abbe.service.identification.artefact_answer import deviation_of_artefacts, touched_boxes_mm, unsensed_axis
+from abbe.service.identification.removal import CampaignTable, RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
 from abbe.service.identification.solve_report import assess, solution_doc
 from abbe.service.identification.solve_tables import scale_free
-from abbe.service.identification.table_removal import CampaignTable
 from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest, reasons_against
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.coverage import reached_mm
@@ -265,7 +264,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
         The readings do not support the map, or (``without_scale``) the scales are not the least certain.
     """
     solved = solve_runs(site, runs)
-    if not only_artefacts(solved.joint) and (beyond := beyond_the_prior(solved.joint)):
+    if not solved.joint.only_artefacts and (beyond := beyond_the_prior(solved.joint)):
         raise TableRefused(f"the readings do not support tables: {beyond.what}", f"{beyond.remedy}; nothing was written")
     change, predicted, left_out = change_of(solved, without_scale=without_scale)
     return Proposal(solved, quantise(added(base.tables, change), lsb_nm * 1e-6), change, predicted, left_out)
@@ -273,7 +272,7 @@ def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_sca
 
 def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTables, Predicted, tuple[str, ...]]:
     """Return the tables that a solution adds to those in force, the prediction, and omissions as text; arguments as for `propose`."""
-    if only_artefacts(solved.joint):
+    if solved.joint.only_artefacts:
         return _change_where_touched(solved)
     if not without_scale:
         change = nine_tables(solved.joint, GRID)

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, fields
 from abbe.drivers.api import BankState, DeviceInfo, Identity, has_one_table
 from abbe.service.domain.document import Doc
 from abbe.service.errors import TableRefused
-from abbe.service.push.capabilities import Capabilities, objection
+from abbe.service.push.journal import Capabilities, objection
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
@@ -33,7 +33,7 @@ class LevelStatus:
 
     @property
     def level(self) -> int:
-        """Capability level (`abbe.service.push.capabilities`)."""
+        """Capability level (`abbe.service.push.journal`)."""
         return self.capabilities.level
 
 

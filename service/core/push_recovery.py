@@ -20,10 +20,10 @@ from abbe.service.core.jobs import MachineClaim
 from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse
-from abbe.service.scheduler import record
 from abbe.service.scheduler.loop import AlarmSink
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 
 log = structlog.get_logger("abbe.recovery")
 
@@ -109,7 +109,7 @@ class PushRecovery:
         return True
 
     async def _report(self, trouble: Exception) -> None:
-        cause = record.cause_of(trouble)
+        cause = verify.cause_of(trouble)
         text = f"{cause.code}: {cause.what}" + (f" - {cause.remedy}" if cause.remedy else "")
         if text == self._reported:
             return

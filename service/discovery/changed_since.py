@@ -23,9 +23,8 @@ from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.effects.model_book import LASTING, applies, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable
-from abbe.service.identification.effect_removal import subtract_effects
+from abbe.service.identification.removal import NOTHING, RemovedTable, campaign_table, remove_table, subtract_effects, subtract_table
 from abbe.service.identification.solution_field import stored_field
-from abbe.service.identification.table_removal import NOTHING, RemovedTable, campaign_table, remove_table, subtract_table
 from abbe.service.runs.observations import run_data
 from abbe.service.storage.store import Store
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, images_of, tables_of

@@ -31,8 +31,8 @@ from abbe.service.domain.run import Run
 from abbe.service.effects.axis_test import SLOW_DRIFT
 from abbe.service.effects.model_book import applies, extended_book, readings_of, without
 from abbe.service.errors import NotObservable
+from abbe.service.identification.removal import NO_TABLE, CampaignTable, remove_table, table_line
 from abbe.service.identification.solve import ALL_READINGS
-from abbe.service.identification.table_removal import NO_TABLE, CampaignTable, remove_table, table_line
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.observations import run_data
 

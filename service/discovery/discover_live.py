@@ -21,7 +21,7 @@ from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import version
 from abbe.service.errors import CampaignRefused, UnsafeToMove
-from abbe.service.identification.table_removal import campaign_table
+from abbe.service.identification.removal import campaign_table
 from abbe.service.sequences.steps import CampaignPlan, TestPlan, Unmount
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -27,11 +27,6 @@ NO_LENGTH = "; no length is calibrated: the scale is not observable"
 NOT_SENSED = "; the third direction was not sensed"
 
 
-def only_artefacts(joint: JointSolution) -> bool:
-    """Whether all readings of a solution are points of artefacts."""
-    return all(run.kind == "artefact" for run in joint.data)
-
-
 def artefact_lines(joint: JointSolution) -> list[str]:
     """Return the errors that the poses of an artefact hide, the pose that would show them, their share of the named fields, and a separate
     fit of every workpiece."""

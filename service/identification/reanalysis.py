@@ -15,10 +15,9 @@ from abbe.service.campaign_data.campaign_folder import from_store, store_solutio
 from abbe.service.children import started_safely
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import AbbeError, ConfigError
-from abbe.service.identification.effect_removal import remove_effects
+from abbe.service.identification.removal import campaign_table, remove_effects
 from abbe.service.identification.solve import solve_runs
 from abbe.service.identification.solve_report import assess, solution_doc
-from abbe.service.identification.table_removal import campaign_table
 from abbe.service.storage.store import Store
 
 J = TypeVar("J")

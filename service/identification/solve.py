@@ -29,8 +29,7 @@ from abbe.service.runs.artefact_points import calibrated_lengths
 from abbe.service.runs.coverage import reached_mm
 from abbe.service.runs.observations import bar_noise_mm, run_data
 from abbe.service.site import Site
-from abbe.service.verification.iso_report import laser_inputs
-from abbe.service.verification.reduction import holds_at
+from abbe.service.verification.reduction import holds_at, laser_inputs
 
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
@@ -123,19 +122,19 @@ def solve_runs(
     data = tuple(run_data(r) for r in used)
     inputs = laser_inputs(instruments or {})
     priors = replace(Priors(), laser_scale=inputs.u_wavelength)
-    lengths, faults = calibrated_lengths(used), list[ArtefactFault]()
-    points = (*data, *lengths)
-    if all(r.is_artefact for r in used):
+    touched, faults = [r for r in used if r.is_artefact], list[ArtefactFault]()
+    points = (*data, *calibrated_lengths(used)) if touched else data
+    if len(touched) == len(used):
         progress("points of artefacts: features, poses, motions")
         points, faults = undone(points, lambda runs: settled_points(site.machine, runs, priors))
     joint = solve_joint(site.machine, points, model=model, priors=priors, progress=progress)
-    if not all(r.is_artefact for r in used) and (
+    if len(touched) < len(used) and (
         beyond := beyond_the_prior(joint, instead="; solved for rigid6, scales and squareness only" if free else "")
     ):
         flags.append(beyond)
         joint = solve_joint(site.machine, points, model="rigid6", priors=priors, progress=progress) if free else joint
     flags += check_instruments(joint, points)
-    flags += [CampaignIssue(f.run, f.what, f.done, False) for f in (*faults, *seen(joint))]
+    flags += [CampaignIssue(f.run, f.what, f.done, False) for f in (*faults, *(seen(joint) if touched else ()))]
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
     digests = {r.run_id: measured_digest(r) for r in used}

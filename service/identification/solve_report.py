@@ -51,10 +51,10 @@ from abbe.service.domain.solution_file import (
     WithoutScale,
     WorstPoint,
 )
-from abbe.service.identification.artefact_answer import artefact_lines, only_artefacts
+from abbe.service.identification.artefact_answer import artefact_lines
+from abbe.service.identification.removal import with_unknown_table
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
 from abbe.service.identification.stored_prediction import prediction_of
-from abbe.service.identification.unknown_table import with_unknown_table
 from abbe.service.tables.measured_with import distinct
 
 VERDICTS = ("mostly assumption", "usable with care", "good")
@@ -179,7 +179,7 @@ def assess(solved: Solved, *, unknown_table: bool = False) -> Assessment:
         compensable_mask(prediction),
         mean_linear(joint),
     )
-    return found if only_artefacts(joint) else replace(found, scale_free=_scale_free(found))
+    return found if solved.joint.only_artefacts else replace(found, scale_free=_scale_free(found))
 
 
 def _over_volume(sources: ErrorSources) -> Prediction:
@@ -260,7 +260,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         motions={m.name: MotionValue(status=m.status, u=m.u, data_share=m.share, reason=m.reason) for m in o.motions},
         rank=Rank(rank=o.rank, of=len(o.terms), effective_rank=o.observed.effective_rank),
         rough=list(rough_lines(joint)),
-        artefacts=artefact_lines(joint),
+        artefacts=artefact_lines(joint) if joint.has_artefacts else [],
         not_observable=not_observable(found),
         advice=[a.text for a in o.advice],
         observability=ObservabilityNumber(

@@ -17,7 +17,7 @@ from abbe.models.uncertainty.scales import SCALE_TEXTS, without_scales
 from abbe.models.uncertainty.sources import error_sources
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
-from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts
+from abbe.service.identification.artefact_answer import deviation_of_artefacts
 from abbe.service.identification.solve_report import Assessment, point, solution_verdict
 
 ProgressText = Callable[[str], None]
@@ -91,7 +91,7 @@ def deviation_text(found: Assessment, points_mm: F2) -> str:
     empty in a direction that was not sensed); ``U_``: expanded uncertainty, 95 %.
     """
     notes = [f"# verdict: {solution_verdict(found).word}"]
-    if only_artefacts(found.joint):
+    if found.joint.only_artefacts:
         deviation, expanded, frame = deviation_of_artefacts(found.joint, points_mm)
         found_faults = "; ".join(flag.line for flag in found.solved.flags)
         notes = [f"# frame: {frame}", f"# verdict: {found_faults}" if found_faults else notes[0]]

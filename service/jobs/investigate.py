@@ -36,7 +36,7 @@ from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES, current
 from abbe.service.errors import AbbeError, CampaignRefused, NotObservable, Stopped, TableMismatch, TableRefused
-from abbe.service.identification.table_removal import campaign_table
+from abbe.service.identification.removal import campaign_table
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan

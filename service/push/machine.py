@@ -12,8 +12,7 @@ from collections.abc import Callable
 from abbe.drivers.api import BankState
 from abbe.service.domain.push_entry import BEFORE_ACTIVATION, GOING_BACK, TERMINAL, PushState
 from abbe.service.push.back import MAX_UNANSWERED, OWNERS, go_back, in_force, mismatch_doc, record
-from abbe.service.push.capabilities import objection
-from abbe.service.push.journal import Journal, OperationOrder, PushFacts, facts_to_act_on
+from abbe.service.push.journal import Journal, OperationOrder, PushFacts, facts_to_act_on, objection
 from abbe.service.push.operations import (
     BRACKETS,
     FORGET,

@@ -7,7 +7,7 @@ import numpy as np
 from abbe.models.arrays import F2
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
-from abbe.service.identification.artefact_answer import deviation_of_artefacts, only_artefacts, touched_boxes_mm
+from abbe.service.identification.artefact_answer import deviation_of_artefacts, touched_boxes_mm
 from abbe.service.rendering.document import PictureBlock, Section, TextTable
 from abbe.service.rendering.plots.slices import PLANES, SlicePlane, SliceTexts, colour_top, magnification, slice_plot
 
@@ -18,7 +18,7 @@ MOST = 3
 
 def artefact_sections(joint: JointSolution) -> list[Section]:
     """Return the section of a solution of artefacts alone; none for other solutions."""
-    if not only_artefacts(joint):
+    if not joint.only_artefacts:
         return []
     slices = [one for box in touched_boxes_mm(joint) for one in _planes(joint, box)][:MOST]
     top = colour_top(np.concatenate([np.linalg.norm(s.deviation_um, axis=2).ravel() for s, _ in slices]))

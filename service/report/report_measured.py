@@ -19,6 +19,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import SolutionFile
+from abbe.service.domain.verification import Verdict
 from abbe.service.errors import AbbeError, MeasurementFault
 from abbe.service.identification.solve_report import HIDDEN_NOTE, Assessment
 from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
@@ -37,7 +38,7 @@ from abbe.service.runs.observations import run_data
 from abbe.service.verification.iso_readings import approaches_of
 from abbe.service.verification.iso_report import UM, Evaluated, evaluate, positioning_rows
 from abbe.service.verification.reduction import holds_at
-from abbe.service.verification.verify import DIAGONALS, Verdict, figure_rows, figures
+from abbe.service.verification.verify import DIAGONALS, figure_rows, figures
 
 URAD = 1e6
 STATED = "as its file states it"

@@ -15,9 +15,10 @@ import numpy as np
 from abbe.service.campaign_data.provenance import run_digest, versions
 from abbe.service.domain.machine import AxisMaterial, Issuer, Item
 from abbe.service.domain.run import Run
+from abbe.service.domain.verification import Verdict
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
-from abbe.service.verification.verify import Verdict, judge, overall
+from abbe.service.verification.verify import judge, overall
 
 Doc = dict[str, Any]
 NAMES = {"ballbar": "telescoping ball-bar", "laser": "laser displacement meter"}

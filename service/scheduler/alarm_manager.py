@@ -20,13 +20,13 @@ from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.jobs.investigate import Note
-from abbe.service.scheduler import record
 from abbe.service.scheduler.job import FollowUp, Job, failure
 from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
+from abbe.service.verification import verify
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, next_step
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_facts, evaluate_alarm, last_seq
 
@@ -218,7 +218,7 @@ class AlarmManager(RetryingStore):
         """Write an entry with its message and its record in the audit."""
         messages = []
         if self._channels.topic is not None and kind in CODES:
-            head = {"schema": record.SCHEMA, "machine": self._machine, "code": CODES[kind], "at_utc": self._clock.utc().isoformat()}
+            head = {"schema": verify.SCHEMA, "machine": self._machine, "code": CODES[kind], "at_utc": self._clock.utc().isoformat()}
             messages.append(
                 (self._channels.topic, head | {"kind": str(kind), "what": facts.text, "signals": [asdict(one) for one in facts.signals]})
             )
@@ -276,7 +276,7 @@ class _Investigation(_AlarmJob):
         return self._last
 
     async def failed(self, error: Exception) -> JobOutcome:
-        cause = record.cause_of(error)
+        cause = verify.cause_of(error)
         how = "was ended by a person" if isinstance(error, Stopped | Aborted) else "failed"
         await self._note(AlarmKind.FAILED, AlarmFacts(text=f"the investigation {how}: {cause.what}", cause=cause))
         return self._last

@@ -20,9 +20,9 @@ from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, Stopped
-from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
 from abbe.service.sequences.control import Control, State
+from abbe.service.verification import verify
 
 log = structlog.get_logger("abbe.job")
 
@@ -168,7 +168,7 @@ def is_defect(error: Exception) -> bool:
 
 def failure(error: Exception) -> JobOutcome:
     """Return the outcome of work that failed or that a person ended: cause, remedy, and the notes of the error."""
-    ended, cause = isinstance(error, Stopped | Aborted), record.cause_of(error)
+    ended, cause = isinstance(error, Stopped | Aborted), verify.cause_of(error)
     parts = [cause.what, "" if ended else cause.remedy, *getattr(error, "__notes__", [])]
     return JobOutcome("stopped" if ended else "failed", "; ".join(filter(None, parts)))
 
@@ -209,16 +209,16 @@ class _CheckJob(Job[Doc]):
 
     def __init__(self, checks: CheckJobs, schedule: Schedule, slot_utc: datetime) -> None:
         self.terms, self._checks = schedule, checks
-        self._occasion = record.Occasion(checks.machine, schedule, slot_utc)
+        self._occasion = verify.Occasion(checks.machine, schedule, slot_utc)
         self._started_utc, self._started_s = checks.clock.utc(), checks.clock.monotonic_s()
         self._doc: Doc | None = None
 
     async def do(self, progress: ProgressSink, control: Control) -> Doc:
-        return record.check_doc(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
+        return verify.check_doc(self._occasion, await self._checks.check(self.terms.recipe, progress, control))
 
     async def failed(self, error: Exception) -> Doc:
-        log.warning("check failed", schedule=self.terms.name, **asdict(record.cause_of(error)), exc_info=_traceback(error))
-        return record.failed_doc(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
+        log.warning("check failed", schedule=self.terms.name, **asdict(verify.cause_of(error)), exc_info=_traceback(error))
+        return verify.failed_doc(self._occasion, error, self._started_utc, self._checks.clock.monotonic_s() - self._started_s)
 
     async def end(self, outcome: Doc) -> SlotState:
         self._doc = outcome

@@ -11,10 +11,10 @@ import structlog
 
 from abbe.service.clock import Clock
 from abbe.service.errors import StoreError
-from abbe.service.scheduler import record
 from abbe.service.scheduler.ports import Doc, OpenSlot
 from abbe.service.storage.repositories.service_records import RUNNING
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 
 log = structlog.get_logger("abbe.store")
 
@@ -112,7 +112,7 @@ class StoreShelf(RetryingStore):
             verification_topic, alarm_topic = self._topics
             messages.append((verification_topic, doc))
             if doc["cause"] is not None:
-                messages.append((alarm_topic, self._of_machine(record.alarm(doc))))
+                messages.append((alarm_topic, self._of_machine(verify.alarm(doc))))
         number = await self._write(self._store.verifications.add_with_messages, self._machine_id, doc, messages)
         self._posted()
         return number
@@ -124,4 +124,4 @@ class StoreShelf(RetryingStore):
             self._posted()
 
     def _of_machine(self, doc: Doc) -> Doc:
-        return {"schema": record.SCHEMA, "machine": self._machine, **doc}
+        return {"schema": verify.SCHEMA, "machine": self._machine, **doc}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import groupby
 from typing import Any
 
@@ -30,6 +30,7 @@ from abbe.service.verification.reduction import (
     Reduction,
     Way,
     diagonal_reduction_of,
+    laser_inputs,
     reduction_of,
     ways,
 )
@@ -103,13 +104,6 @@ def evaluate(
         _circles(out, circles)
         out.statements.append(BAR_STATEMENT.format(repeat=U_REPEAT_MM * UM))
     return out
-
-
-def laser_inputs(instruments: dict[str, Any]) -> StatedInputs:
-    """Stated inputs of a laser: the defaults, or larger uncertainties that the campaign file states."""
-    laser, usual = instruments.get("laser") or {}, StatedInputs()
-    wave, kelvin = laser.get("u_wavelength", usual.u_wavelength), laser.get("u_scale_temperature_k", usual.u_scale_temperature_k)
-    return replace(usual, u_wavelength=float(wave), u_scale_temperature_k=float(kelvin))
 
 
 def scale_budget(instruments: dict[str, Any]) -> ScaleBudget:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -230,3 +231,10 @@ def ways(budget: ScaleBudget, reduction: Reduction, standard: str, u_wavelength:
         text = f" at 20 °C of a workpiece with {reduction.of_workpiece}"
         found.append(Way(text, f"{standard}, of a workpiece at 20 °C", sure(part.u_reduced), part))
     return found
+
+
+def laser_inputs(instruments: dict[str, Any]) -> StatedInputs:
+    """Stated inputs of a laser: the defaults, or larger uncertainties that the campaign file states."""
+    laser, usual = instruments.get("laser") or {}, StatedInputs()
+    wave, kelvin = laser.get("u_wavelength", usual.u_wavelength), laser.get("u_scale_temperature_k", usual.u_scale_temperature_k)
+    return replace(usual, u_wavelength=float(wave), u_scale_temperature_k=float(kelvin))

@@ -1,17 +1,24 @@
-"""Verification: figures of runs that identification did not use, compared before and after a push, and against limits."""
+"""Verification: figures of runs that identification did not use, compared before and after a push, judged against limits; and the check
+as a document: the same for the store, for MQTT, for the status page and for JSON clients."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal
+import math
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass
+from datetime import UTC, datetime
+from typing import Any, Literal
 
 import numpy as np
 
+from abbe.drivers.errors import DriverError
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure, same_pose
+from abbe.service.config_schema import MachineFile
 from abbe.service.domain.run import ArtefactSetup, Run
-from abbe.service.errors import MeasurementFault, TableRefused
+from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.verification import CheckFailure, CheckResult, Verdict
+from abbe.service.errors import AbbeError, MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
 from abbe.service.runs.observations import run_data
 
@@ -25,7 +32,9 @@ the size of a correction. An assumption of this service: without sensors in the 
 
 DIAGONALS = frozenset({"ppp", "npp", "pnp", "ppn"})
 
-Verdict = Literal["pass", "fail", "cannot tell"]
+MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
+SCHEMA = 1
+"""Version of the documents of checks. It rises when a key changes its meaning or disappears, not for new keys."""
 
 
 @dataclass(frozen=True)
@@ -213,3 +222,150 @@ def figure_rows(found: VerificationFigures) -> dict[str, tuple[float, float]]:
     if found.helix is not None:
         rows["helix_rms_um"] = (found.helix.value_mm * 1e3, found.helix.u_mm * 1e3)
     return rows
+
+
+def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetime, duration_s: float) -> CheckResult:
+    """Judge the measured runs of a check against the limits, with their uncertainty.
+
+    Raises
+    ------
+    MeasurementFault
+        The runs are not a complete check: a body diagonal is missing, or a run was not measured to its end.
+    """
+    rows = figure_rows(figures(runs))
+    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
+    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} µm (limit {limits[k]:g})" for k in limits if k in rows)
+    against = [*_air(runs, config.limits.temperature_c), *_ended(config, rows, started)]
+    if against:
+        verdict = "cannot tell"
+        text = f"{' and '.join(against)}, so the figures cannot be judged; {text}"
+    return CheckResult(
+        verdict,
+        {k: v for k, (v, _) in rows.items()},
+        {k: COVERAGE * u for k, (_, u) in rows.items()},
+        {k: v for k, v in limits.items() if k in rows},
+        [r.run_id for r in runs],
+        campaign,
+        started,
+        duration_s,
+        text,
+        not against,
+    )
+
+
+def _name(key: str) -> str:
+    return {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}[key]
+
+
+def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:
+    """Return a sentence for each instrument behind these figures whose certificate had ended by ``started``."""
+    days = {"body_diagonal_um": ("laser", config.calibration.laser), "helix_rms_um": ("ball-bar", config.calibration.ballbar)}
+    today = started.astimezone(UTC).date()
+    known = ((name, day) for key, (name, day) in days.items() if key in names and day is not None)
+    return [f"the certificate of the {name} ended on {day}" for name, day in known if day < today]
+
+
+def _air(runs: list[Run], window: tuple[float, float]) -> list[str]:
+    outside, (low, high) = _outside(runs, window), window
+    return [] if outside is None else [f"air temperature {outside:.1f} C is outside of {low:g}..{high:g} C"]
+
+
+def _outside(runs: list[Run], window: tuple[float, float]) -> float | None:
+    """Return the air temperature farthest outside the window; None if all are inside or none was measured."""
+    low, high = window
+    temperatures = [float(t) for r in runs for t in r.columns.air_c]
+    worst = max(temperatures, key=lambda t: max(low - t, t - high), default=None)
+    return worst if worst is not None and not low <= worst <= high else None
+
+
+@dataclass(frozen=True, slots=True)
+class Occasion:
+    """Identity of a check: machine, schedule and slot."""
+
+    machine: str
+    schedule: Schedule
+    slot_utc: datetime
+
+
+def check_doc(occasion: Occasion, result: CheckResult) -> dict[str, Any]:
+    """Return the document of a completed check."""
+    return {
+        **_head(occasion, result.started_utc),
+        "duration_s": round(result.duration_s, 3),
+        # An unknown verdict must not look like a pass.
+        "verdict": result.verdict if result.verdict in MARK else "cannot tell",
+        "values": _figures(result.values),
+        "uncertainties": _figures(result.uncertainties),
+        "limits": _figures(result.limits),
+        "campaign": result.campaign,
+        "runs": list(result.run_labels),
+        "text": result.text,
+        "comparable": bool(result.comparable),
+        "cause": None,
+    }
+
+
+def failed_doc(occasion: Occasion, cause: Exception, started_utc: datetime, duration_s: float) -> dict[str, Any]:
+    """Return the document of a check that could not be completed: no verdict, but the cause."""
+    reason = cause_of(cause)
+    return {
+        **_head(occasion, started_utc),
+        "duration_s": round(duration_s, 3),
+        "verdict": "cannot tell",
+        "values": {},
+        "uncertainties": {},
+        "limits": {},
+        "campaign": "",
+        "runs": [],
+        "text": f"The check could not be completed: {reason.what}",
+        "cause": asdict(reason),
+    }
+
+
+def alarm(doc: dict[str, Any]) -> dict[str, Any]:
+    """Return the alarm that goes with the document of a failed check."""
+    return {**doc["cause"], "at_utc": doc["started_utc"]}
+
+
+def cause_of(cause: Exception) -> CheckFailure:
+    """Return code, one line of cause, remedy and device of an error.
+
+    Of a group of errors, the first one of a driver or of Abbe counts: if several devices fail together, the first failure matters.
+    """
+    known = _first(cause)
+    if isinstance(known, DriverError):
+        what = _line(f"{known.operation}: {known.detail}")
+        return CheckFailure(code=known.code, what=what, remedy=known.remedy, device=known.device)
+    if isinstance(known, AbbeError):
+        return CheckFailure(code=known.code, what=_line(known.detail), remedy=known.remedy)
+    name = type(known).__name__
+    return CheckFailure(code="ABB-001", what=_line(f"{name}: {known}"), remedy="see the service's log for details")
+
+
+def _first(cause: Exception) -> Exception:
+    if not isinstance(cause, ExceptionGroup):
+        return cause
+    leaves = [_first(member) for member in cause.exceptions]
+    return next((leaf for leaf in leaves if isinstance(leaf, DriverError | AbbeError)), leaves[0])
+
+
+def _head(occasion: Occasion, started_utc: datetime) -> dict[str, Any]:
+    return {
+        "schema": SCHEMA,
+        "machine": occasion.machine,
+        "schedule": occasion.schedule.name,
+        "recipe": occasion.schedule.recipe,
+        "slot_utc": occasion.slot_utc.isoformat(),
+        "started_utc": started_utc.isoformat(),
+    }
+
+
+def _figures(figures: Mapping[str, float]) -> dict[str, float | None]:
+    """Replace NaN and infinity, which JSON does not have, with null."""
+    return {name: float(value) if math.isfinite(value) else None for name, value in figures.items()}
+
+
+def _line(text: str) -> str:
+    """Return ``text`` as one printable line of at most 500 characters: device strings end up in logs and pages."""
+    return " ".join("".join(c if c.isprintable() else " " for c in text).split())[:500]

@@ -30,10 +30,10 @@ from abbe.service.domain.verification import CheckResult
 from abbe.service.push.operations import VerificationResult
 from abbe.service.rendering.numbers import with_uncertainty
 from abbe.service.runs.columns import load_run
-from abbe.service.scheduler import record
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
+from abbe.service.verification import verify
 from abbe.service.verification.verify import figure_rows, figures
 from tests.scenarios.conftest import simulated
 
@@ -302,7 +302,7 @@ def test_a_scheduled_check_is_reported_with_the_limits_it_was_judged_by(stored, 
     found = CheckResult(
         "cannot tell", rows, {"body_diagonal_um": 3.0, "helix_rms_um": 0.4}, limits, ["h1"], "small", when, 9.0, "too close"
     )
-    doc = record.check_doc(record.Occasion("sim", Schedule("nightly", "0 6 * * *", "UTC", "quick-check", 600.0), when), found)
+    doc = verify.check_doc(verify.Occasion("sim", Schedule("nightly", "0 6 * * *", "UTC", "quick-check", 600.0), when), found)
     copied = tmp_path / "other.sqlite3"
     shutil.copy(stored / "abbe.sqlite3", copied)
     with Store.open(f"sqlite:///{copied}") as store:

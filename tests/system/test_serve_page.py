@@ -17,8 +17,8 @@ from playwright.sync_api import Browser, Page, sync_playwright
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from tests.pages_world import Filled, Served, served
 from tests.system.serve_bench import free_port, require, service
 from tests.system.serve_check import Result
@@ -78,9 +78,9 @@ def fill(folder: Path, weeks: int) -> None:
         machine = store.machines.add("mill-7", {"name": "mill-7"})
         for week in range(weeks):
             at = now - timedelta(days=7 * (weeks - 1 - week), hours=3)
-            occasion = record.Occasion("mill-7", WEEKLY, at)
+            occasion = verify.Occasion("mill-7", WEEKLY, at)
             if week == weeks - 3:
-                doc = record.failed_doc(
+                doc = verify.failed_doc(
                     occasion, LinkDown("modbus+tcp://127.0.0.1:5021", "connect", "connection refused", "is the laser on?"), at, 5.0
                 )
             else:
@@ -96,7 +96,7 @@ def fill(folder: Path, weeks: int) -> None:
                 result = Result(
                     verdict, values, text=text, started_utc=at, duration_s=312.0, campaign=f"quick-check {at:%Y-%m-%d %H:%M:%S}"
                 )
-                doc = record.check_doc(occasion, result)
+                doc = verify.check_doc(occasion, result)
             store.verifications.add_with_messages(machine, doc, [])
 
 

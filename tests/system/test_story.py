@@ -18,8 +18,8 @@ from playwright.sync_api import Browser, Locator, Page, Route
 
 from abbe.service.clock import SystemClock
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from abbe.service.verification.alarms import READ_CHECKS, check_facts, evaluate_alarm
 from tests.pages_world import PHRASE, Filled, Served, filled_once, served
 from tests.pretended_push import KEPT, as_if_pushed
@@ -37,7 +37,7 @@ def check(store: Store, filled: Filled, at: datetime, um: float) -> int:
     """Store a check as the service does, with what it does to the alarm of its recipe; return its number."""
     machine = store.campaigns.find(filled.campaign).machine_id
     told = Result("pass", {"body_diagonal_um": um, "helix_rms_um": 1.2}, text="pass", started_utc=at, duration_s=300.0, campaign="")
-    store.verifications.add_with_messages(machine, record.check_doc(record.Occasion(filled.machine, filled.schedules[1], at), told), [])
+    store.verifications.add_with_messages(machine, verify.check_doc(verify.Occasion(filled.machine, filled.schedules[1], at), told), [])
     latest = store.verifications.of_machine(filled.machine, READ_CHECKS)
     found = evaluate_alarm(store, filled.machine, RECIPE, latest, 0.0)
     if found.kind is not None:

@@ -117,7 +117,7 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
     from abbe.service.discovery.discovery_store import journal_of
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.identification.table_removal import campaign_table
+    from abbe.service.identification.removal import campaign_table
 
     base = None if store is None else current(store, campaign.site.name)
     since = None if store is None else reference_solution(store, campaign)

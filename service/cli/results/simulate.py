@@ -40,7 +40,7 @@ def simulate(
     from abbe.service.domain.progress import Progress
     from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import current
-    from abbe.service.identification.table_removal import campaign_table
+    from abbe.service.identification.removal import campaign_table
     from abbe.service.rendering.document_page import form_of
 
     if report is not None:

@@ -15,6 +15,7 @@ from abbe.service.cli.common import (
     DbOption,
     JsonOption,
     MachineOption,
+    answer_into,
     conclude,
     database_url,
     missing_file,
@@ -23,7 +24,6 @@ from abbe.service.cli.common import (
     print_json,
     print_table,
 )
-from abbe.service.cli.form import answer_into
 from abbe.service.cli.results.solve_text import print_solution
 
 if TYPE_CHECKING:
@@ -187,10 +187,9 @@ def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tup
     from abbe.service.cli.running import display
     from abbe.service.config import load_machine
     from abbe.service.domain.progress import Progress
-    from abbe.service.identification.effect_removal import remove_effects
+    from abbe.service.identification.removal import campaign_table, remove_effects
     from abbe.service.identification.solve import solve_runs
     from abbe.service.identification.solve_report import as_doc, assess, solution_of
-    from abbe.service.identification.table_removal import campaign_table
 
     known = remove_effects(store, chosen, campaign_table(store, chosen))
     campaign = known.campaign

@@ -30,8 +30,8 @@ def print_solution(summary: Assessment, solution: SolutionFile, *, details: bool
 
 def summary_lines(summary: Assessment, solution: SolutionFile) -> list[str]:
     """Return at most ten lines: the verdict, how well the volume is known, the largest errors, and objections."""
+    from abbe.service.identification.removal import table_line
     from abbe.service.identification.solve_report import worst_line
-    from abbe.service.identification.table_removal import table_line
 
     o, lines = summary.observability, []
     if solution.verdict is not None:

@@ -126,7 +126,7 @@ class Verifications(Repository):
         machine_id : int
             Used for checks that failed before they had a campaign.
         doc : dict
-            As made by `abbe.service.scheduler.record`.
+            As made by `abbe.service.verification.verify`.
         messages : sequence of (topic, document)
             For the broker; each document gets the number of the verification.
         """

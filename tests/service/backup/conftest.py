@@ -17,8 +17,8 @@ from abbe.service.capture.segment import CHUNK, scan
 from abbe.service.capture.settings import segment_path
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.schedule import Schedule
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from tests.service.capture.capture_bench import abandon, batch, new_run, segment_bytes
 from tests.service.core.fakes import Result
 
@@ -87,7 +87,7 @@ def _shop(folder: Path) -> Shop:
             at = START + timedelta(days=day)
             values = {"body_diagonal_um": 9.0 + 0.3 * max(day - 20, 0) + 0.5 * rng.normal()}
             result = Result(values=values, uncertainties={"body_diagonal_um": 1.0}, limits={"body_diagonal_um": 20.0}, started_utc=at)
-            store.verifications.add_with_messages(machine_id, record.check_doc(record.Occasion("VMC-1", schedule, at), result), [])
+            store.verifications.add_with_messages(machine_id, verify.check_doc(verify.Occasion("VMC-1", schedule, at), result), [])
         book = AuditBook(store, url)
         for k in range(5):
             book.write(AuditEvent(who="user:ana", action=f"POST /thing/{k}", target="x", outcome="done 200", doc={"n": k, "why": "µm"}))

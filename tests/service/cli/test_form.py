@@ -12,8 +12,7 @@ import typer
 
 from abbe.service.cli import run
 from abbe.service.cli.app import app
-from abbe.service.cli.common import print_table
-from abbe.service.cli.form import first_sentence
+from abbe.service.cli.common import first_sentence, print_table
 
 ROOT: Any = typer.main.get_command(app)
 GROUPS = [("", ROOT), *((name, command) for name, command in ROOT.commands.items() if hasattr(command, "commands"))]

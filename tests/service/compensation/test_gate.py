@@ -11,7 +11,7 @@ from abbe.service.compensation import gate
 from abbe.service.compensation.gate import PushContext, check_promise
 from abbe.service.compensation.proved_levels import LevelStatus
 from abbe.service.errors import TableRefused
-from abbe.service.push.capabilities import Capabilities
+from abbe.service.push.journal import Capabilities
 from abbe.service.push.validate import PushLimits
 
 

@@ -24,12 +24,12 @@ from abbe.service.errors import AlarmRefused, StoreError
 from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS
 from abbe.service.queries.status import alarms
-from abbe.service.scheduler import record
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import CheckJobs, carry_out
 from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
@@ -48,7 +48,7 @@ def result(day: float, diagonal: float = 9.0, helix: float = 1.4, **more: Any) -
 def records(*results: Result, recipe: str = "quick-check") -> list[VerificationRecord]:
     """Newest first, as the store gives them."""
     schedule = Schedule("daily", "0 5 * * *", "UTC", recipe)
-    docs = [record.check_doc(record.Occasion("mill-7", schedule, r.started_utc), r) for r in results]
+    docs = [verify.check_doc(verify.Occasion("mill-7", schedule, r.started_utc), r) for r in results]
     return [VerificationRecord(k, 1, None, d["verdict"], d, d["started_utc"]) for k, d in enumerate(docs, 1)][::-1]
 
 

@@ -13,13 +13,13 @@ import pytest
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import StoreError
-from abbe.service.scheduler import record
 from abbe.service.scheduler.retrying_store import PAUSES_S, StoreLedger, StoreShelf
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from tests.service.core.fakes import FakeClock, Result, utc
 
 SLOT = utc(2026, 6, 1, 4)
-OCCASION = record.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "verify"), SLOT)
+OCCASION = verify.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "Europe/Berlin", "verify"), SLOT)
 TOPICS = ("abbe/mill-7/verification", "abbe/mill-7/alarm")
 
 
@@ -72,7 +72,7 @@ async def test_two_processes_race_for_slots(store: Store, url: str) -> None:
 
 async def test_a_verification_and_its_message(store: Store) -> None:
     posted: list[int] = []
-    number = await shelf_of(store, posted).keep(record.check_doc(OCCASION, Result()))
+    number = await shelf_of(store, posted).keep(verify.check_doc(OCCASION, Result()))
     (kept,) = store.verifications.of_machine("mill-7")
     assert (kept.id, kept.verdict, kept.campaign_id) == (number, "pass", None)
     (row,) = store.outbox.pending()
@@ -86,13 +86,13 @@ async def test_a_verification_and_its_message(store: Store) -> None:
 async def test_a_verification_belongs_to_its_campaign(store: Store) -> None:
     machine = store.machines.add("mill-7", {"geometry": 1})
     campaign = store.campaigns.add(machine, "check-1", {})
-    await shelf_of(store, []).keep(record.check_doc(OCCASION, Result()))
+    await shelf_of(store, []).keep(verify.check_doc(OCCASION, Result()))
     (kept,) = store.verifications.of_machine("mill-7")
     assert (kept.campaign_id, kept.machine_id) == (campaign, machine)
 
 
 async def test_a_failed_check_brings_an_alarm(store: Store) -> None:
-    doc = record.failed_doc(OCCASION, LinkDown("tcp://127.0.0.1:5021", "connect", "refused", "switch it on"), SLOT, 0.4)
+    doc = verify.failed_doc(OCCASION, LinkDown("tcp://127.0.0.1:5021", "connect", "refused", "switch it on"), SLOT, 0.4)
     await shelf_of(store, []).keep(doc)
     result, alarm = store.outbox.pending()
     assert json.loads(result.payload)["verdict"] == "cannot tell"
@@ -102,7 +102,7 @@ async def test_a_failed_check_brings_an_alarm(store: Store) -> None:
 
 
 async def test_result_and_message_together_or_not_at_all(store: Store) -> None:
-    doc = record.check_doc(OCCASION, Result())
+    doc = verify.check_doc(OCCASION, Result())
     with pytest.raises(ValueError, match="JSON compliant"):
         store.verifications.add_with_messages(store.machines.add("mill-7", {}), doc, [("t", doc), ("t", {"x": float("nan")})])
     assert store.verifications.of_machine("mill-7") == []
@@ -119,7 +119,7 @@ async def test_a_store_that_fails_for_a_while(store: Store, monkeypatch: pytest.
 
     shelf = shelf_of(store, [])
     monkeypatch.setattr(store.verifications, "add_with_messages", flaky)
-    assert await shelf.keep(record.check_doc(OCCASION, Result())) == 1
+    assert await shelf.keep(verify.check_doc(OCCASION, Result())) == 1
 
 
 async def test_a_store_that_stays_broken_is_an_error(tmp_path: Path) -> None:

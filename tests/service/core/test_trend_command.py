@@ -11,8 +11,8 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.domain.schedule import Schedule
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from tests.service.core.fakes import Result, utc
 
 START = utc(2026, 3, 1, 5)
@@ -46,8 +46,8 @@ def machine(tmp_path: Path) -> Path:
                 limits={"body_diagonal_um": 20.0, "helix_rms_um": 5.0},
                 started_utc=at,
             )
-            store.verifications.add_with_messages(machine_id, record.check_doc(record.Occasion("mill-7", schedule, at), result), [])
-        gone = record.failed_doc(record.Occasion("mill-7", schedule, at), OSError("cable"), at, 1.0)
+            store.verifications.add_with_messages(machine_id, verify.check_doc(verify.Occasion("mill-7", schedule, at), result), [])
+        gone = verify.failed_doc(verify.Occasion("mill-7", schedule, at), OSError("cable"), at, 1.0)
         store.verifications.add_with_messages(machine_id, gone, [])
     return path
 

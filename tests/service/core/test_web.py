@@ -18,8 +18,8 @@ from abbe.service.domain.verification import Verification
 from abbe.service.errors import StoreError
 from abbe.service.queries.reader import Reader, read_as
 from abbe.service.queries.status import StatusReader
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from abbe.service.web import formatting
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS
@@ -46,11 +46,11 @@ class Site:
 
     def keep(self, result: Result | Exception, days_ago: float = 0) -> None:
         at = NOW - timedelta(days=days_ago)
-        occasion = record.Occasion("mill-7", WEEKLY, at)
+        occasion = verify.Occasion("mill-7", WEEKLY, at)
         if isinstance(result, Exception):
-            doc = record.failed_doc(occasion, result, at, 1.0)
+            doc = verify.failed_doc(occasion, result, at, 1.0)
         else:
-            doc = {**record.check_doc(occasion, result), "started_utc": at.isoformat()}
+            doc = {**verify.check_doc(occasion, result), "started_utc": at.isoformat()}
         self.store.verifications.add_with_messages(self.store.machines.add("mill-7", {}), doc, [])
 
 
@@ -89,7 +89,7 @@ async def test_a_running_check_and_a_device_that_fails(site: Site) -> None:
     assert "measuring" in page
     assert "revision 3 of 10" not in page
     assert "revolution 3 of 10" in page
-    site.board.job_ended(record.failed_doc(record.Occasion("m", WEEKLY, NOW), LinkDown(DEVICES["laser"], "read", "gone"), NOW, 1))
+    site.board.job_ended(verify.failed_doc(verify.Occasion("m", WEEKLY, NOW), LinkDown(DEVICES["laser"], "read", "gone"), NOW, 1))
     status = (await site.client.get("/api/v1/status")).json()
     assert [device["state"] for device in status["devices"]] == ["not used yet", "fault"]
     assert status["job"] is None
@@ -217,8 +217,8 @@ def test_trend_survives_figures_without_size_or_limit() -> None:
     ],
 )
 def test_a_point_shows_the_verdict_of_its_figure(verdict: str, diagonal: float, helix: float, expected: tuple[str, str]) -> None:
-    doc = record.check_doc(
-        record.Occasion("m", WEEKLY, NOW), Result(verdict=verdict, values={"body_diagonal_um": diagonal, "helix_rms_um": helix})
+    doc = verify.check_doc(
+        verify.Occasion("m", WEEKLY, NOW), Result(verdict=verdict, values={"body_diagonal_um": diagonal, "helix_rms_um": helix})
     )
     check = read_as(Verification, {"id": 1, **doc})
     assert (figure_verdict(check, "body_diagonal_um"), figure_verdict(check, "helix_rms_um")) == expected

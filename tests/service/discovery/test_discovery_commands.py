@@ -17,8 +17,7 @@ from abbe.service.discovery.discover import prepare
 from abbe.service.domain.discovery_file import DiscoveryFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import current, no_table_lines
-from abbe.service.identification.effect_removal import remove_effects
-from abbe.service.identification.table_removal import NO_TABLE
+from abbe.service.identification.removal import NO_TABLE, remove_effects
 from abbe.service.storage.store import Store
 from tests.service.discovery.discovery_bench import WIDTH_MM, Search, write_case
 

@@ -10,8 +10,7 @@ from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.prediction import predict_deviation
 from abbe.models.uncertainty.sources import error_sources
-from abbe.service.identification.table_removal import removed_table
-from abbe.service.identification.unknown_table import effect_mm, reading_patterns_mm, with_unknown_table
+from abbe.service.identification.removal import effect_mm, reading_patterns_mm, removed_table, with_unknown_table
 from tests.experiments.campaigns.population import draw_case
 
 ORDER = 6

@@ -31,8 +31,8 @@ from abbe.service.queries.status import Status, StatusReader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
 from abbe.service.report.report_parts import Rules
-from abbe.service.scheduler import record
 from abbe.service.storage.store import Store
+from abbe.service.verification import verify
 from abbe.service.verification.verified_by import STRANGE_TABLE, VerifiedBy, verified_by
 from abbe.service.web.page import environment, render
 from abbe.service.web.pages.times import trend_screen
@@ -59,8 +59,8 @@ class World:
         if table is not None:
             self.store.campaigns.add(machine, name, {"table_crc": crc32(table)})
         told = Result(verdict, {"body_diagonal_um": value}, text=verdict, started_utc=begun or now, duration_s=1.0, campaign=name)
-        occasion = record.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "UTC", "quick-check"), now)
-        return self.store.verifications.add_with_messages(machine, record.check_doc(occasion, told), [])
+        occasion = verify.Occasion("mill-7", Schedule("weekly", "0 6 * * 1", "UTC", "quick-check"), now)
+        return self.store.verifications.add_with_messages(machine, verify.check_doc(occasion, told), [])
 
     def push(self, base: bytes, new: bytes, states: tuple[Any, ...] = KEPT, **doc: Any) -> None:
         asyncio.run(as_if_pushed(self.store, SystemClock(), "mill-7", doc or {"proposal": 1}, (base, new), states))

@@ -25,8 +25,8 @@ from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch
-from abbe.service.identification.effect_removal import IN_U
-from abbe.service.identification.table_removal import (
+from abbe.service.identification.removal import (
+    IN_U,
     NO_TABLE,
     NOT_REMOVED,
     RemovedTable,
