@@ -27,13 +27,16 @@ COPIED = ("abbe", "service", "drivers", "models", "simulators", "tests", "pyproj
 TEST_S, RUN_S = 400, 3600
 HEAD = """# Mistakes that the tests have to notice
 
-One mistake each is put into a copy of the source; the named test has to fail with it, and passes without it. Half an hour
-of two busy cores writes this page
-(`python -m tests.experiments.campaigns.mutants --page docs/explanation/mutants.md`), last on {date}: {killed} of {all} killed.
-CI runs the rows marked *, all at once. The push protocol has mutants of its own: `python -m tests.experiments.campaigns.push mutants`.
+Each mistake is put into a copy of the source (`tests/experiments/campaigns/source_mutants.py` says where); the named test has to fail
+with it, and passes without it. CI runs the rows marked *, all at once. The push protocol has mutants of its own
+([develop](../how-to/develop.md)).
 
-| mistake | in | outcome | by |
-|---|---|---|---|
+    python -m tests.experiments.campaigns.mutants --page docs/explanation/mutants.md      # half an hour, two cores; writes this page
+
+{date}: {killed} of {all} killed.
+
+| mistake | noticed by |
+|---|---|
 """
 
 
@@ -117,10 +120,15 @@ def outcome(copy: Path, mutant: Mutant, good: dict[tuple[str, ...], Found]) -> t
     return found.word, found.failed[0] if found.failed else ""
 
 
+def _noticed(mutant: Mutant, word: str, by: str) -> str:
+    test = f"`{by.split('[')[0]}`"
+    return test if word == "killed" else f"{word} in `{mutant.path}`: {test}"
+
+
 def page(rows: list[tuple[Mutant, str, str]]) -> str:
     """The table for docs/explanation/mutants.md."""
     killed = sum(word == "killed" for _, word, _ in rows)
-    lines = [f"| {m.name}{' *' if m.fast else ''} | `{m.path}` | {word} | `{by.split('[')[0]}` |" for m, word, by in rows]
+    lines = [f"| {m.name}{' *' if m.fast else ''} | {_noticed(m, word, by)} |" for m, word, by in rows]
     return HEAD.format(date=datetime.now(UTC).date(), killed=killed, all=len(rows)) + "\n".join(lines) + "\n"
 
 
