@@ -15,7 +15,7 @@ import sys
 import threading
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import partial
 from importlib.metadata import version
 from pathlib import Path
@@ -24,7 +24,7 @@ from typing import TYPE_CHECKING
 import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
-from abbe.service.channel.messages import PROTOCOL, Begin, RulesSummary
+from abbe.service.channel.messages import PROTOCOL, Begin
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board, BoardWatch, SnapshotSource, StatePublisher, VerifiedWatch
 from abbe.service.core.jobs import JobRegistry
@@ -133,7 +133,7 @@ class Service:
             self._listening.getsockname()[1],
             setup.web.behind_tls,
             tuple(setup.schedules),
-            RulesSummary(**asdict(setup.rules) | {"materials": dict(setup.rules.materials)}),
+            setup.rules,
             setup.summary,
             self._jobs.full.names,
             setup.web.memory_mb,

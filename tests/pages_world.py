@@ -30,6 +30,7 @@ from abbe.service.compensation.proposals import Promise, candidate_of
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind, Signal
@@ -38,7 +39,6 @@ from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import solution_doc
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

@@ -16,6 +16,7 @@ from abbe.models.compensation.tables import NineTables, nine_tables, quantise
 from abbe.public.estimates import Estimate
 from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.domain.machine import Rules
 from abbe.service.errors import TableRefused
 from abbe.service.identification.removal import campaign_table, remove_effects, table_line
 from abbe.service.identification.solve import ProgressText, solve_runs
@@ -25,7 +26,6 @@ from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.plots.tables import motion_bands
 from abbe.service.report.report import solution_report
 from abbe.service.report.report_measured import SolutionResult
-from abbe.service.report.report_parts import Rules
 from abbe.service.report.solution_sections import motion_curves, parameter_rows
 
 

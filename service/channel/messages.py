@@ -13,15 +13,14 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from dataclasses import dataclass, field
-from datetime import date
+from dataclasses import dataclass
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject
+from abbe.service.domain.machine import MachineObject, Rules
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
@@ -39,19 +38,6 @@ _STRICT = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, defer_bui
 
 Steering = Literal["stop", "abort", "pause", "resume"]
 Outcome = Literal["done", "unknown", "busy", "forbidden", "conflict"]
-
-
-@dataclass(frozen=True, slots=True)
-class RulesSummary:
-    """Limits, certificates, allowed temperature, expansion, instruments and laboratory from the machine file, as reports use them."""
-
-    limits_um: dict[str, float]
-    calibrated_until: dict[str, date] | None
-    temperature_c: tuple[float, float] | None
-    materials: dict[str, AxisMaterial] = field(default_factory=dict)
-    instruments: dict[str, str] = field(default_factory=dict)
-    issuer: Issuer | None = None
-    item: Item | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +66,7 @@ class Begin:
     port: Annotated[int, Field(ge=0, le=65535)]
     behind_tls: bool
     schedules: Annotated[tuple[Schedule, ...], Field(max_length=200)]
-    rules: RulesSummary
+    rules: Rules
     plan: MachineSummary | None
     campaigns: Annotated[tuple[Word, ...], Field(max_length=200)]
     memory_mb: Annotated[int, Field(ge=1)]

@@ -13,10 +13,9 @@ from abbe.service.config_schema import OpcUa, Web
 from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
 from abbe.service.core.table_watch import LookAtTable
-from abbe.service.domain.machine import control_of
+from abbe.service.domain.machine import Rules, control_of
 from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.mqtt.broker import Broker, Topics
-from abbe.service.report.report_parts import Rules
 from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady

@@ -5,7 +5,8 @@ Nothing here connects to a device.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
+from datetime import date
 from typing import Annotated, Literal, Self
 from urllib.parse import parse_qs, urlsplit
 
@@ -190,3 +191,21 @@ class Issuer(ConfigTable):
     place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
         default="customer", description="where machines are measured, as seen from the laboratory"
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Rules:
+    """Rules from a machine file, as reports and pages use them.
+
+    ``limits_um``: of figures, named as in `abbe.service.verification.verify.figure_rows`; ``calibrated_until``: certificates, by
+    instrument; ``temperature_c``: allowed, of the air; ``materials``: expansion of the scales by axis; ``instruments``: what identifies
+    each, with its certificate; ``issuer``, ``item``: of a certificate, None without a laboratory.
+    """
+
+    limits_um: dict[str, float] = field(default_factory=dict)
+    calibrated_until: dict[str, date] | None = None
+    temperature_c: tuple[float, float] | None = None
+    materials: dict[str, AxisMaterial] = field(default_factory=dict)
+    instruments: dict[str, str] = field(default_factory=dict)
+    issuer: Issuer | None = None
+    item: Item | None = None

@@ -14,6 +14,7 @@ import numpy as np
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
 from abbe.service.config_schema import MachineFile
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
@@ -28,7 +29,7 @@ from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
-from abbe.service.report.report_parts import Doc, Rules
+from abbe.service.report.report_parts import Doc
 from abbe.service.report.report_table import table_remarks
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store

@@ -27,6 +27,7 @@ from abbe.service.discovery.discovery_text import (
 )
 from abbe.service.discovery.effect_pages import unit
 from abbe.service.domain.finding import EffectFound, Finding
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import StoreError
@@ -35,7 +36,6 @@ from abbe.service.rendering.model import PlaceMap, ResidualTrace
 from abbe.service.rendering.numbers import NOT_AVAILABLE, plain
 from abbe.service.rendering.plots.gap import gap_bars, place_plot, trace_plot
 from abbe.service.report import report_parts as parts
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 
 AXES = "XYZ"

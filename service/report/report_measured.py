@@ -17,6 +17,7 @@ from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.domain.document import Doc
 from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.domain.verification import Verdict
@@ -30,7 +31,6 @@ from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
-from abbe.service.report.report_parts import Rules
 from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import about_axis, not_judged, path_axis, reached_mm, reached_text

@@ -5,15 +5,13 @@ from __future__ import annotations
 import hashlib
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from datetime import date
 from importlib.metadata import version
 from typing import Any
 
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
-from abbe.service.domain.machine import AxisMaterial, Issuer, Item
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run
 from abbe.service.domain.verification import Verdict
 from abbe.service.rendering.document import Instrument, ReportFigure, Sign
@@ -40,24 +38,6 @@ SENSORS = (
     ("temp_spindle_C", "temperature of the spindle", "°C"),
     ("pressure_air_Pa", "air pressure", "Pa"),
 )
-
-
-@dataclass(frozen=True, slots=True)
-class Rules:
-    """Rules from a machine file.
-
-    ``limits_um``: of figures, named as in `figure_rows`; ``calibrated_until``: certificates; ``temperature_c``: allowed, of the air;
-    ``materials``: expansion of the scales by axis; ``instruments``: what identifies each, with its certificate; ``issuer``, ``item``: of a
-    certificate, None without a laboratory.
-    """
-
-    limits_um: Mapping[str, float] = field(default_factory=dict)
-    calibrated_until: Mapping[str, date] | None = None
-    temperature_c: tuple[float, float] | None = None
-    materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
-    instruments: Mapping[str, str] = field(default_factory=dict)
-    issuer: Issuer | None = None
-    item: Item | None = None
 
 
 def machine_facts(machine: Doc) -> dict[str, str]:

@@ -13,8 +13,8 @@ import signal
 import pytest
 
 from abbe.service.cli import run as cli
+from abbe.service.domain.machine import Rules
 from abbe.service.report.report import stored_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.coverage import covered_share, not_judged
 from abbe.service.storage.store import Store

@@ -13,9 +13,9 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import Browser, Locator, Page
 
+from abbe.service.domain.machine import Rules
 from abbe.service.rendering.document_page import write_document
 from abbe.service.report.report import certified, numbered_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from tests.conftest import ROOT
 from tests.pages_world import Filled, filled_once, served

@@ -23,8 +23,8 @@ from abbe.service.cli.common import (
 if TYPE_CHECKING:
     from datetime import date
 
+    from abbe.service.domain.machine import Rules
     from abbe.service.rendering.document import Document
-    from abbe.service.report.report_parts import Rules
 
 
 OUT_HELP = "FILE.pdf, .html, .csv, .json, .xml (DCC), .dfq (AQDEF) or .qif; may be repeated. Default: a PDF here."

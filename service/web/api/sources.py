@@ -8,10 +8,10 @@ from typing import Annotated
 
 from fastapi import Path, Query
 
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.schedule import Schedule
 from abbe.service.queries.reader import Reader
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.web.core_link.logtail import LogTail
 

@@ -13,10 +13,10 @@ from fastapi import Query
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
 
+from abbe.service.domain.machine import Rules
 from abbe.service.errors import NotStored
 from abbe.service.queries.reader import Reader, storable
 from abbe.service.queries.status import Status, StatusSource
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.storage.store import Store
 from abbe.service.web import formatting

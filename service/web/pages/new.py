@@ -11,8 +11,8 @@ from typing import Annotated
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse
 
-from abbe.service.channel.messages import RulesSummary
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.machine import Rules
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
@@ -54,7 +54,7 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
         )
 
 
-def expired_certificates(rules: RulesSummary | None, today: date) -> list[tuple[str, date]]:
+def expired_certificates(rules: Rules | None, today: date) -> list[tuple[str, date]]:
     """Instruments with an expired certificate, and its last valid day."""
     certificates = {} if rules is None or rules.calibrated_until is None else rules.calibrated_until
     return [(kind, until) for kind, until in sorted(certificates.items()) if until < today]

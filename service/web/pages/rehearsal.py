@@ -5,7 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.channel.messages import MachineSummary, RulesSummary
+from abbe.service.channel.messages import MachineSummary
+from abbe.service.domain.machine import Rules
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.dry_run_page import picture
@@ -73,7 +74,7 @@ class Rehearsals:
     machine: MachineSummary | None = None
     recipes: tuple[str, ...] = ()
     rates_hz: tuple[int, ...] = RATES_HZ
-    rules: RulesSummary | None = None
+    rules: Rules | None = None
 
     def choices(self) -> tuple[str, ...]:
         """Names that can be rehearsed, without sampling rates: startable recipes first, then the full campaign.

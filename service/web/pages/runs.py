@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls, Rules
 from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError
@@ -21,7 +21,6 @@ from abbe.service.rendering.numbers import COVERAGE, finite, plain
 from abbe.service.rendering.plots.curves import difference_plot, overlay_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.report.report_measured import Measured, run_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.observations import run_data

@@ -6,7 +6,6 @@ import asyncio
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 
 import structlog
 import uvicorn
@@ -19,7 +18,6 @@ from abbe.service.errors import AbbeError, ChannelBroken
 from abbe.service.plant.gather import Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.users.people import UserAccounts
 from abbe.service.web.api.sources import Sources
@@ -146,7 +144,7 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
         reader=reader,
         schedules=begin.schedules,
         devices=lambda: core.devices,
-        rules=Rules(**asdict(begin.rules) | {"materials": begin.rules.materials}),
+        rules=begin.rules,
         tail=capture_log(),
     )
     app = create_app(view, version=begin.version, hosts=begin.hosts, auth=auth, parts=parts, plant=plant, api=api)

@@ -22,7 +22,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
-from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject
+from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject, Rules
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
@@ -79,7 +79,7 @@ CORE = [
         8080,
         False,
         (),
-        m.RulesSummary(
+        Rules(
             {},
             None,
             None,

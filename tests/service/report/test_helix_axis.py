@@ -10,13 +10,13 @@ import pytest
 from abbe.models.paths import even_helix_points, helix_points
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.capture.live import angles_along
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run, parsed_setup
 from abbe.service.errors import MeasurementFault
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.report import report_measured
 from abbe.service.report.report_measured import Measured, run_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.coverage import helix_axis
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.compare_runs import LoadedRun, curve, incomparable_reason

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from abbe.service.campaign_data.campaign_folder import Campaign
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.measured import RunRecord, this_process
 from abbe.service.errors import MeasurementFault
 from abbe.service.report.report_measured import Measured, campaign_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.coverage import COMPLETE, LEAST, covered_share, not_judged, with_state
 from abbe.service.verification.compare_runs import incomparable_reason
 from abbe.service.verification.iso_report import evaluate

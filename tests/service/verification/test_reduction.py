@@ -11,10 +11,9 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
-from abbe.service.domain.machine import AxisMaterial
+from abbe.service.domain.machine import AxisMaterial, Rules
 from abbe.service.domain.run import Run
 from abbe.service.report.report import push_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from abbe.service.verification.iso_report import Evaluated, evaluate

@@ -19,6 +19,7 @@ from abbe.drivers.tables import crc32
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.push_entry import S
 from abbe.service.domain.schedule import Schedule
 from abbe.service.plant.gather import Gatherer, PlantFacts
@@ -30,7 +31,6 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusReader
 from abbe.service.rendering.document import Document
 from abbe.service.report.report import numbered_report
-from abbe.service.report.report_parts import Rules
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
 from abbe.service.verification.verified_by import STRANGE_TABLE, VerifiedBy, verified_by

@@ -16,10 +16,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from abbe.service.domain.machine import Rules
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.identification.solution_field import stored_field
 from abbe.service.rendering.numbers import MM, Unit
-from abbe.service.report.report_parts import Rules
 from abbe.service.runs.observations import run_data
 from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, RunDifference, curve, figure_rows
 from abbe.service.web import frame, language

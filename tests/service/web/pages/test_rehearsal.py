@@ -9,9 +9,9 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from abbe.service.channel.messages import MachineSummary, RulesSummary
+from abbe.service.channel.messages import MachineSummary
 from abbe.service.clock import SystemClock
-from abbe.service.domain.machine import MachineObject
+from abbe.service.domain.machine import MachineObject, Rules
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.recipes.campaigns import RATES_HZ, named, recipe_plan, split_recipe_name
@@ -110,6 +110,6 @@ async def test_a_name_that_its_rate_makes_too_long_is_refused() -> None:
 
 def test_certificates_that_are_over_are_told() -> None:
     today = utc(2026, 11, 22, 6).date()
-    rules = RulesSummary({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
+    rules = Rules({}, {"ballbar": today.replace(year=2025), "laser": today}, None)
     assert expired_certificates(rules, today) == [("ballbar", today.replace(year=2025))]
     assert expired_certificates(None, today) == []
