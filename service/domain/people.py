@@ -9,11 +9,12 @@ from abbe.service.domain.document import Row
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class UserRecord(Row):
-    """A user. ``disabled_utc``: no login since then. Users are never deleted: the audit names them."""
+    """A user. ``pin``: hash; None: no PIN. ``disabled_utc``: no login since then. Users are never deleted: the audit names them."""
 
     name: str
     role: str
     password: str = field(repr=False)
+    pin: str | None = field(default=None, repr=False)
     disabled_utc: str | None
 
 

@@ -264,6 +264,7 @@ users = Table(
     Column("name", String(100), nullable=False, unique=True),
     Column("role", String(20), nullable=False),
     Column("password", String(200), nullable=False),
+    Column("pin", String(200)),
     Column("disabled_utc", String(32)),
     Column("created_utc", String(32), nullable=False),
 )

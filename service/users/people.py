@@ -29,6 +29,9 @@ AT_A_TIME = 2
 """Concurrent hashes. Each takes 19 MiB and a processor for tens of milliseconds: many logins must not starve the capture."""
 SHORTEST, LONGEST_PASSWORD = 12, 256
 LEAST_DIFFERENT = 5
+PIN, LEAST_DIFFERENT_DIGITS = re.compile(r"[0-9]{6,12}"), 3
+PIN_ROLES = frozenset({Role.VIEWER, Role.OPERATOR})
+"""Roles whose users may log in by PIN, which is easier to guess than a password: none that proposes, approves or manages."""
 T = TypeVar("T")
 COMMON = ("password", "passwort", "qwertyuiop", "administrator", "letmein", "welcome", "1234567890", "abcdefghij", "changeme")
 
@@ -113,6 +116,21 @@ def check_new(name: str, password: str) -> None:
         raise PasswordRefused("the password is one of the first that attackers try", "use a sentence of a few words")
 
 
+def check_new_pin(pin: str) -> None:
+    """Refuse a PIN that is easily guessed.
+
+    Raises
+    ------
+    PasswordRefused
+        The PIN has too few or too many digits, too few different ones, or counts up or down.
+    """
+    if not PIN.fullmatch(pin):
+        raise PasswordRefused("a PIN needs 6 to 12 digits", "choose other digits")
+    steps = {ord(b) - ord(a) for a, b in zip(pin, pin[1:], strict=False)}
+    if len(set(pin)) < LEAST_DIFFERENT_DIGITS or steps in ({1}, {-1}):
+        raise PasswordRefused("the PIN is one of the first that people try", "choose other digits")
+
+
 IDLE = timedelta(minutes=15)
 LONGEST = timedelta(hours=12)
 TOUCH = timedelta(seconds=30)
@@ -174,13 +192,22 @@ class UserAccounts:
         user, new = self.get(name), role_of(role)
         if new is not Role.ADMIN:
             self._keep_an_admin(user)
-        self._store.people.change(user.id, role=new)
+        self._store.people.change(user.id, role=new, **({} if new in PIN_ROLES else {"pin": None}))
 
     def set_password(self, name: str, password: str) -> None:
-        """Change a user's password; the user's sessions end."""
+        """Change a user's password; the user's sessions end, and the PIN is removed."""
         user = self.get(name)
         check_new(name, password)
-        self._store.people.change(user.id, password=self.passwords.hash(password))
+        self._store.people.change(user.id, password=self.passwords.hash(password), pin=None)
+
+    def set_pin(self, name: str, pin: str) -> None:
+        """Change a user's PIN; empty: remove it. Raises UserRefused for a role that needs a password, and PasswordRefused."""
+        user = self.get(name)
+        if pin and Role(user.role) not in PIN_ROLES:
+            raise UserRefused(f"a user who is {user.role} logs in with a password only", "use the password")
+        if pin:
+            check_new_pin(pin)
+        self._store.people.change(user.id, keep_session=True, pin=self.passwords.hash(pin) if pin else None)
 
     def disable(self, name: str, *, enable: bool = False) -> None:
         """Disable a user with all sessions and tokens, or enable it again. Users are never deleted: the audit names them."""
@@ -203,6 +230,16 @@ class UserAccounts:
         if self.passwords.outdated(user.password):
             self._store.people.change(user.id, keep_session=True, password=self.passwords.hash(password))
         return user
+
+    def check_pin(self, name: str, pin: str) -> UserRecord | None:
+        """The user, if the PIN matches, the role may use one and the user is enabled; else None. Everybody takes the same time."""
+        user = self._store.people.find(name) if NAME.fullmatch(name) else None
+        right = self.passwords.verify(None if user is None else user.pin, pin)
+        return user if right and user is not None and user.disabled_utc is None and Role(user.role) in PIN_ROLES else None
+
+    def with_pin(self) -> list[UserRecord]:
+        """Users who may log in by PIN."""
+        return [u for u in self._store.people.all() if u.pin is not None and u.disabled_utc is None and Role(u.role) in PIN_ROLES]
 
     def known(self, name: str) -> bool:
         """Whether there is such a user. Callers must not show or log an unknown name: it may be a mistyped password."""

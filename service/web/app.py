@@ -45,6 +45,7 @@ from abbe.service.web.pages.plant_screens import add_plant_screens
 from abbe.service.web.pages.proposals import add_table_screen
 from abbe.service.web.pages.rehearsal import Rehearsals
 from abbe.service.web.pages.routes import add_pages
+from abbe.service.web.pages.users import add_user_pages
 from abbe.service.web.schemas import Health, LatestChecks, Problem
 from abbe.service.web.strip import strip_of
 
@@ -146,6 +147,7 @@ def create_app(
         context = _page_context(source, auth, api, pushes_itself=parts is not None and parts.pushes_itself)
         add_pages(app, context)
         add_alarm_pages(app, context)
+        add_user_pages(app, context)
         add_check_page(app, context)
         add_live_page(app, context, parts.core.jobs if parts is not None else tuple)
         add_new_page(app, context, parts.plans if parts is not None else Rehearsals())

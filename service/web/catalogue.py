@@ -59,6 +59,8 @@ STATUS: dict[type[AbbeError], int] = {
     errors.ModelUnknown: 409,
     errors.EffectUnknown: 409,
     errors.ConfigError: 409,
+    errors.UserRefused: 409,
+    errors.PasswordRefused: 409,
 }
 """HTTP statuses of errors. A class that is missing here has the status of its nearest base class, else 500."""
 

@@ -22,7 +22,8 @@ from abbe.service.users.roles import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 
 GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024
-BY_FORM = ("/login", "/logout", "/proposal/approve", "/alarm/acknowledge", "/alarm/shelve")
+BY_FORM = ("/login", "/logout", "/proposal/approve", "/alarm/acknowledge", "/alarm/shelve", "/settings/password", "/settings/pin",
+           *(f"/users/{form}" for form in ("add", "role", "password", "disable", "enable")))  # fmt: skip
 """Not in the OpenAPI document; that these are all is asked in tests/service/web/test_bodies.py."""
 PATIENCE_S = 30.0
 
@@ -107,6 +108,7 @@ def test_a_gigabyte_at_every_route_costs_no_memory(made: Running) -> None:
     Path(f"/proc/{page}/clear_refs").write_text("5")  # the highest from here on
     before_kb, most = memory_kb(page, "VmRSS"), 0
     for path in paths:
+        time.sleep(len(everybody) * 2 / 50.0)  # an address has 50 requests a second
         for name, who in everybody:
             for chunked in (False, True):
                 status, answer, sent = pour(made.port, path, who, chunked=chunked)

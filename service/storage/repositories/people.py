@@ -50,7 +50,7 @@ class People(Repository):
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))
 
     def change(self, user_id: int, *, keep_session: bool = False, **values: str | None) -> None:
-        """Change role, password or ``disabled_utc`` of a user, and end the user's sessions in the same transaction."""
+        """Change role, password, PIN or ``disabled_utc`` of a user, and end the user's sessions in the same transaction."""
 
         def work(connection: Connection) -> None:
             connection.execute(update(users).where(users.c.id == user_id).values(**values))

@@ -66,9 +66,9 @@ class Authenticator:
         """Name of the session cookie. With TLS only this host can set it."""
         return f"__Host-{self._cookie}" if tls else self._cookie
 
-    def device_cookie(self) -> str:
-        """Name of the cookie that marks a browser with an earlier login."""
-        return f"{self._cookie}-device"
+    def device_cookie(self, name: str) -> str:
+        """Name of the cookie that marks a browser with an earlier login of this user; several people may share a browser."""
+        return f"{self._cookie}-device-{hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
     async def who(self, bearer: str | None, secret: str | None, *, in_use: bool = True, to_stop: bool = False) -> Principal:
         """Identify the visitor by token, else by cookie; an onlooker while there are no users.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from math import ceil
 from typing import Annotated
 
@@ -30,15 +31,17 @@ DEVICE_S = 90 * 86_400
 
 def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
     """Add login, logout and the user routes to the application."""
+    say: Callable[..., str] = env.globals["t"]
 
-    def page(status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
+    async def page(request: Request, status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
         headers = {"Retry-After": str(ceil(wait_s))} if wait_s else None
-        return HTMLResponse(env.get_template("login.html").render(text=text), status, headers)
+        here = await asyncio.to_thread(_with_pin_here, auth, request)
+        return HTMLResponse(env.get_template("login.html").render(text=text, here=here), status, headers)
 
     @app.get("/login", include_in_schema=False)
     @needs(PUBLIC)
-    async def form() -> HTMLResponse:
-        return page(200)
+    async def form(request: Request) -> HTMLResponse:
+        return await page(request, 200)
 
     @app.post("/login", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(PUBLIC)
@@ -47,22 +50,23 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         fields = await form_of(request)
         if fields is None:
             return problem(413, "a login is a short form of two fields")
-        name, password = fields.get("name", ""), fields.get("password", "")
+        name, secret, by_pin = fields.get("name", ""), fields.get("password", ""), "pin" in fields
         visit.target = "unknown user"
         origin = await asyncio.to_thread(_login_origin, auth, request, name)
-        user, wait_s, tried = await identified(auth, origin, name, password)
+        if by_pin and not origin.device:
+            return await page(request, 401, say("login.password_first"))
+        user, wait_s, tried = await identified(auth, origin, name, fields["pin"] if by_pin else secret, by_pin=by_pin)
         if not tried:
-            return page(429, f"Too many tries. Wait {ceil(wait_s)} s.", wait_s)
+            return await page(request, 429, say("login.wait", n=ceil(wait_s)), wait_s)
         visit.target = name if await asyncio.to_thread(auth.people.known, name) else "unknown user"
         if user is None:
-            return page(401, "Name or password is wrong." + (f" Next try in {ceil(wait_s)} s." if wait_s else ""))
+            return await page(request, 401, say("login.wrong") + (f" {say('login.next', n=ceil(wait_s))}" if wait_s else ""))
         visit.who = f"user:{user.name}"
-        secret = await asyncio.to_thread(auth.people.begin, user, visit.secret)
         answer = RedirectResponse("/", 303)
-        _set_cookie(auth, request, answer, secret)
+        _set_cookie(auth, request, answer, await asyncio.to_thread(auth.people.begin, user, visit.secret))
         if not origin.device:
             made, tls = await asyncio.to_thread(auth.people.new_device, user), is_tls(request, behind_tls=auth.behind_tls)
-            answer.set_cookie(auth.device_cookie(), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
+            answer.set_cookie(auth.device_cookie(user.name), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
         return answer
 
     @app.post("/logout", include_in_schema=False)
@@ -78,20 +82,26 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
     _add_reading(app, auth)
 
 
-async def identified(auth: Authenticator, origin: LoginOrigin, name: str, password: str) -> tuple[UserRecord | None, float, bool]:
-    """The user whose name and password these are, or None; seconds until the next try; False: not tried, after too many wrong ones."""
+async def identified(
+    auth: Authenticator, origin: LoginOrigin, name: str, secret: str, *, by_pin: bool = False
+) -> tuple[UserRecord | None, float, bool]:
+    """The user whose name and password (or PIN) these are, or None; seconds until the next try; False: not tried, after too many wrong
+    ones.
+    """
     wait_s = auth.lockout.wait_s(name, origin)
     if wait_s > 0:
         return None, wait_s, False
     # Counted before the password check: simultaneous tries must not all find the account unlocked.
     wait_s = auth.lockout.failed(name, origin)
-    user = await asyncio.to_thread(auth.people.check, name, password)
+    user = await asyncio.to_thread(auth.people.check_pin if by_pin else auth.people.check, name, secret)
     if user is not None:
         auth.lockout.succeeded(name, origin)
     return user, wait_s, True
 
 
-async def signature_refusal(auth: Authenticator, request: Request, password: str) -> Response | None:
+async def signature_refusal(
+    auth: Authenticator, request: Request, password: str, wrong: str = "The password is wrong: nothing was signed."
+) -> Response | None:
     """Refusal of a signature by password of the person who is logged in; None: it is right. Wrong ones count as wrong logins."""
     visit: Visit = request.state.visit
     name = visit.principal.name.partition(":")[2].partition("/")[0]
@@ -100,7 +110,7 @@ async def signature_refusal(auth: Authenticator, request: Request, password: str
     if not tried:
         return problem(429, f"Too many tries. Wait {ceil(wait_s)} s.", headers={"Retry-After": str(ceil(wait_s))})
     again = f" Next try in {ceil(wait_s)} s." if wait_s else ""
-    return None if user is not None else problem(403, f"The password is wrong: nothing was signed.{again}")
+    return None if user is not None else problem(403, f"{wrong}{again}")
 
 
 def _add_reading(app: FastAPI, auth: Authenticator) -> None:
@@ -135,8 +145,14 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
 
 def _login_origin(auth: Authenticator, request: Request, name: str) -> LoginOrigin:
     visit: Visit = request.state.visit
-    device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(), ""))
+    device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(name), ""))
     return LoginOrigin(visit.address, device, local=is_local(visit.address) and not auth.behind_tls)
+
+
+def _with_pin_here(auth: Authenticator, request: Request) -> list[str]:
+    """Names of the users who may log in by PIN in this browser, since they have logged in there by password."""
+    names = [user.name for user in auth.people.with_pin()]
+    return [name for name in names if auth.people.device_of(name, request.cookies.get(auth.device_cookie(name), ""))]
 
 
 def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:

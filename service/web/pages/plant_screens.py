@@ -23,6 +23,7 @@ from abbe.service.queries.fleet import FleetFigure, MachineStatus, machine_statu
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.journal import Trouble, troubles
 from abbe.service.storage.store import Store
+from abbe.service.users.people import PIN_ROLES
 from abbe.service.users.roles import Permission
 from abbe.service.verification.alarm_states import folded, is_open
 from abbe.service.web import language
@@ -255,8 +256,9 @@ def _add_settings(app: FastAPI, context: PageContext, sources: Sources) -> None:
     @app.get("/settings", include_in_schema=False)
     @needs(Permission.READ)
     async def settings() -> HTMLResponse:
-        users = await context.read(sources.reader.store.people.all) if current().may(Permission.USERS) else []
-        return await context.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, users=users)
+        own = await context.read(sources.reader.store.people.find, current().who) if current().who else None
+        by_pin = own is not None and own.role in PIN_ROLES
+        return await context.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, own=own, by_pin=by_pin)
 
     @app.get("/diagnostics", include_in_schema=False)
     @needs(Permission.CONFIGURE)

@@ -230,7 +230,7 @@ async def test_behind_a_proxy_with_tls_cookies_are_secure_and_origins_https(worl
             answer = await client.post("/login", data=form, headers={"Origin": origin})
             assert answer.status_code == status, origin
         cookies = answer.headers.get_list("set-cookie")
-        assert [c.partition("=")[0] for c in cookies] == ["__Host-abbe-8080", "abbe-8080-device"]
+        assert [c.partition("=")[0] for c in cookies] == ["__Host-abbe-8080", "abbe-8080-device-24d4b96f"]
         assert all(word in c for c in cookies for word in ("Secure", "HttpOnly", "SameSite=strict"))
 
 
@@ -283,7 +283,7 @@ async def test_guesses_from_ever_new_addresses_do_not_keep_a_user_out(world: Wor
     async with client_of(app, client=("192.0.2.1", 1)) as client:
         first = await client.post("/login", data=form, headers=OWN)
         assert first.status_code == 303
-    device = first.cookies["abbe-device"]
+    device = first.cookies["abbe-device-24d4b96f"]
     assert device not in str(world.store.audit.events())
     app, _ = behind(world, Endpoint())  # started again: nothing is remembered
     begin = world.people.passwords.hashes
@@ -294,18 +294,18 @@ async def test_guesses_from_ever_new_addresses_do_not_keep_a_user_out(world: Wor
     assert world.people.passwords.hashes - begin <= 10  # in a minute
     for address, cookies, status in (
         ("198.51.100.1", {}, 429),
-        ("198.51.100.1", {"abbe-device": device}, 303),
-        ("10.1.0.1", {"abbe-device": device}, 303),  # behind the same address as one who guesses
+        ("198.51.100.1", {"abbe-device-24d4b96f": device}, 303),
+        ("10.1.0.1", {"abbe-device-24d4b96f": device}, 303),  # behind the same address as one who guesses
         ("127.0.0.1", {}, 303),
-        ("198.51.100.2", {"abbe-device": device[:-1] + ("0" if device[-1] != "0" else "1")}, 429),
-        ("198.51.100.2", {"abbe-device": "x" * 97}, 429),
+        ("198.51.100.2", {"abbe-device-24d4b96f": device[:-1] + ("0" if device[-1] != "0" else "1")}, 429),
+        ("198.51.100.2", {"abbe-device-24d4b96f": "x" * 97}, 429),
     ):
         async with client_of(app, client=(address, 1)) as client:
             answer = await client.post("/login", data=form, headers=OWN | cookie(cookies))
             assert answer.status_code == status, (address, cookies)
     for n in range(9):  # a stolen device is a place to guess from like any other
         async with client_of(app, client=(f"10.9.0.{n}", 1)) as client:
-            answer = await client.post("/login", data={"name": "ana", "password": "x"}, headers=OWN | cookie({"abbe-device": device}))
+            answer = await client.post("/login", data={"name": "ana", "password": "x"}, headers=OWN | cookie({"abbe-device-24d4b96f": device}))
     assert answer.status_code == 429
     for n in range(8):  # whoever guesses for long is not let to make strangers wait for long
         world.clock.later(seconds=61)
@@ -328,6 +328,6 @@ async def test_a_known_browser_is_forgotten_with_the_password(world: World) -> N
 
 async def test_a_known_browser_keeps_its_cookie(gate: Gate) -> None:
     first = await log_in(gate, "a-viewer", PHRASE)
-    gate.client.cookies.set("abbe-device", first.cookies["abbe-device"], path="/login", domain="127.0.0.1")
-    assert "abbe-device" not in (await log_in(gate, "a-viewer", PHRASE)).cookies
-    assert "abbe-device" in (await log_in(gate, "a-operator", PHRASE)).cookies
+    gate.client.cookies.set("abbe-device-677529ba", first.cookies["abbe-device-677529ba"], path="/login", domain="127.0.0.1")
+    assert "abbe-device-677529ba" not in (await log_in(gate, "a-viewer", PHRASE)).cookies
+    assert "abbe-device-a5c643bc" in (await log_in(gate, "a-operator", PHRASE)).cookies

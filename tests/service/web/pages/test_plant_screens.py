@@ -85,7 +85,8 @@ def test_a_certificate_says_how_long_it_holds(tmp_path: Path) -> None:
 def test_who_sees_users_and_diagnostics(running: Served) -> None:
     for name, admin in (("vera", False), ("anna", False), ("adam", True)):
         with as_user(running, name) as client:
-            assert ("petra" in client.get("/settings").text) == admin
+            assert ("petra" in client.get("/users").text) == admin
+            assert "petra" not in client.get("/settings").text
             for path in ("/diagnostics", "/support.zip"):
                 assert client.get(path).status_code == (200 if admin else 403), (name, path)
 

@@ -1,0 +1,124 @@
+"""Users on the page by HTTP: an admin adds, changes and disables them; each person has an own password and PIN; the audit names what was done."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import httpx
+import pytest
+
+from tests.pages_world import PHRASE, USERS, Served, as_user, filled_once, served
+
+NEW = "a quiet hall in autumn"
+FORMS = ("add", "role", "password", "disable", "enable")
+
+
+@pytest.fixture
+def alone(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
+    """A page of its own: these tests change who may log in."""
+    with served(filled_once(tmp_path_factory)) as one:
+        yield one
+
+
+def log_in(running: Served, client: httpx.Client, name: str, **secret: str) -> int:
+    return client.post("/login", data={"name": name} | secret, headers={"Origin": running.base}).status_code
+
+
+@pytest.mark.parametrize("name", USERS)
+def test_only_an_admin_sees_and_changes_users(running: Served, name: str) -> None:
+    admin = USERS[name] == "admin"
+    with as_user(running, name) as client:
+        assert client.get("/users").status_code == (200 if admin else 403)
+        assert client.get("/user?name=olga").status_code == (200 if admin else 403)
+        assert ('href="/users"' in client.get("/settings").text) == admin
+        for form in FORMS:
+            if not admin:
+                assert client.post(f"/users/{form}", data={"name": "olga", "role": "admin"}).status_code == 403, form
+    assert running.store.people.find("olga").role == "operator"  # type: ignore[union-attr]
+
+
+def test_a_user_is_added_once_changed_reset_and_disabled(alone: Served) -> None:
+    form = {"name": "nora", "role": "operator", "new": NEW, "again": NEW}
+    with as_user(alone, "adam") as client:
+        assert "nora" not in client.get("/users").text
+        assert client.post("/users/add", data=form | {"again": "another"}).status_code == 409
+        assert client.post("/users/add", data=form | {"new": "short", "again": "short"}).json()["code"] == "USR-001"
+        assert client.post("/users/add", data=form | {"role": "queen"}).json()["code"] == "USR-002"
+        assert client.post("/users/add", data=form).status_code == 303
+        assert client.post("/users/add", data=form).status_code == 409, "sent twice, added once"
+        assert "nora" in client.get("/users").text
+        with httpx.Client(base_url=alone.base) as person:
+            assert log_in(alone, person, "nora", password=NEW) == 303
+            assert client.post("/users/role", data={"name": "nora", "role": "viewer"}).status_code == 303
+            assert person.get("/api/v1/session").status_code == 401, "a new role ends the login"
+        assert client.post("/users/password", data={"name": "nora", "new": PHRASE, "again": PHRASE}).status_code == 303
+        with httpx.Client(base_url=alone.base) as person:
+            assert (log_in(alone, person, "nora", password=NEW), log_in(alone, person, "nora", password=PHRASE)) == (401, 303)
+            assert client.post("/users/disable", data={"name": "nora"}).status_code == 303
+            assert (person.get("/api/v1/session").status_code, log_in(alone, person, "nora", password=PHRASE)) == (401, 401)
+            assert client.post("/users/enable", data={"name": "nora"}).status_code == 303
+            assert log_in(alone, person, "nora", password=PHRASE) == 303
+        assert client.get("/user?name=nobody").status_code == 404
+    told = [(r.action, r.target, r.outcome) for r in alone.store.audit.events() if r.who == "user:adam" and r.outcome.startswith("done")]
+    assert told == [
+        ("POST /users/add", "user nora: add operator", "done 303"),
+        ("POST /users/role", "user nora: role viewer", "done 303"),
+        ("POST /users/password", "user nora: password", "done 303"),
+        ("POST /users/disable", "user nora: disable", "done 303"),
+        ("POST /users/enable", "user nora: enable", "done 303"),
+    ]
+    assert NEW not in str(alone.store.audit.events())
+
+
+def test_the_last_admin_stays_and_no_refusal_names_a_command(alone: Served) -> None:
+    with as_user(alone, "adam") as client:
+        for answer in (
+            client.post("/users/disable", data={"name": "adam"}),
+            client.post("/users/role", data={"name": "adam", "role": "viewer"}),
+            client.post("/users/role", data={"name": "nobody", "role": "viewer"}),
+        ):
+            assert answer.status_code == 409
+            assert "abbe user" not in answer.text
+
+
+def test_an_own_password_needs_the_present_one_and_ends_every_login(alone: Served) -> None:
+    form = {"new": NEW, "again": NEW}
+    with as_user(alone, "olga") as client, as_user(alone, "olga") as elsewhere:
+        assert client.post("/settings/password", data=form | {"password": "wrong"}).status_code == 403
+        assert client.post("/settings/password", data=form | {"password": PHRASE, "again": "x"}).status_code == 409
+        assert elsewhere.get("/api/v1/session").status_code == 200
+        answer = client.post("/settings/password", data=form | {"password": PHRASE})
+        assert (answer.status_code, answer.headers["location"]) == (303, "/login")
+        assert elsewhere.get("/api/v1/session").status_code == 401
+    with httpx.Client(base_url=alone.base) as person:
+        assert (log_in(alone, person, "olga", password=PHRASE), log_in(alone, person, "olga", password=NEW)) == (401, 303)
+
+
+def test_a_pin_logs_in_where_the_password_did_before_and_nowhere_else(alone: Served) -> None:
+    with httpx.Client(base_url=alone.base) as panel, httpx.Client(base_url=alone.base) as strange:
+        assert log_in(alone, panel, "olga", password=PHRASE) == 303
+        with as_user(alone, "olga") as client:
+            for pin in ("12345", "123456", "987654", "111111", "112211", "abcdef", "1234567890123"):
+                assert client.post("/settings/pin", data={"password": PHRASE, "pin": pin}).status_code == 409, pin
+            assert client.post("/settings/pin", data={"password": "wrong", "pin": "582914"}).status_code == 403
+            assert client.post("/settings/pin", data={"password": PHRASE, "pin": "582914"}).status_code == 303
+        assert 'value="olga"' in panel.get("/login").text
+        assert "olga" not in strange.get("/login").text
+        assert log_in(alone, panel, "olga", pin="582915") == 401
+        assert log_in(alone, panel, "olga", pin="582914") == 303
+        assert log_in(alone, strange, "olga", pin="582914") == 401
+        assert log_in(alone, panel, "vera", pin="582914") == 401
+        for _ in range(5):
+            log_in(alone, panel, "olga", pin="000000")
+        assert log_in(alone, panel, "olga", pin="582914") == 429, "a PIN waits as a password does"
+
+
+def test_who_proposes_approves_or_manages_has_no_pin_and_a_new_password_removes_it(alone: Served) -> None:
+    for name, role in USERS.items():
+        with as_user(alone, name) as client:
+            answer = client.post("/settings/pin", data={"password": PHRASE, "pin": "582914"})
+            assert answer.status_code == (303 if role in {"viewer", "operator"} else 409), role
+    with as_user(alone, "adam") as client:
+        client.post("/users/role", data={"name": "vera", "role": "approver"})
+        client.post("/users/password", data={"name": "olga", "new": NEW, "again": NEW})
+    assert alone.people.with_pin() == []
