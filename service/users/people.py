@@ -14,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from functools import cached_property
+from itertools import pairwise
 from typing import TypeVar
 
 from argon2 import PasswordHasher
@@ -126,7 +127,7 @@ def check_new_pin(pin: str) -> None:
     """
     if not PIN.fullmatch(pin):
         raise PasswordRefused("a PIN needs 6 to 12 digits", "choose other digits")
-    steps = {ord(b) - ord(a) for a, b in zip(pin, pin[1:], strict=False)}
+    steps = {ord(b) - ord(a) for a, b in pairwise(pin)}
     if len(set(pin)) < LEAST_DIFFERENT_DIGITS or steps in ({1}, {-1}):
         raise PasswordRefused("the PIN is one of the first that people try", "choose other digits")
 
@@ -192,7 +193,7 @@ class UserAccounts:
         user, new = self.get(name), role_of(role)
         if new is not Role.ADMIN:
             self._keep_an_admin(user)
-        self._store.people.change(user.id, role=new, **({} if new in PIN_ROLES else {"pin": None}))
+        self._store.people.change(user.id, role=new, pin=user.pin if new in PIN_ROLES else None)
 
     def set_password(self, name: str, password: str) -> None:
         """Change a user's password; the user's sessions end, and the PIN is removed."""

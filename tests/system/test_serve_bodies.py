@@ -8,6 +8,7 @@ from __future__ import annotations
 import resource
 import select
 import socket
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import suppress
@@ -108,7 +109,7 @@ def test_a_gigabyte_at_every_route_costs_no_memory(made: Running) -> None:
     Path(f"/proc/{page}/clear_refs").write_text("5")  # the highest from here on
     before_kb, most = memory_kb(page, "VmRSS"), 0
     for path in paths:
-        time.sleep(len(everybody) * 2 / 50.0)  # an address has 50 requests a second
+        threading.Event().wait(len(everybody) * 2 / 50.0)  # an address has 50 requests a second
         for name, who in everybody:
             for chunked in (False, True):
                 status, answer, sent = pour(made.port, path, who, chunked=chunked)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Callable
 from math import ceil
-from typing import Annotated
+from typing import Annotated, cast
 
 from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
@@ -31,7 +31,7 @@ DEVICE_S = 90 * 86_400
 
 def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
     """Add login, logout and the user routes to the application."""
-    say: Callable[..., str] = env.globals["t"]
+    say = cast("Callable[..., str]", env.globals["t"])
 
     async def page(request: Request, status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
         headers = {"Retry-After": str(ceil(wait_s))} if wait_s else None
@@ -50,17 +50,17 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         fields = await form_of(request)
         if fields is None:
             return problem(413, "a login is a short form of two fields")
-        name, secret, by_pin = fields.get("name", ""), fields.get("password", ""), "pin" in fields
+        name, by_pin = fields.get("name", ""), "pin" in fields
         visit.target = "unknown user"
         origin = await asyncio.to_thread(_login_origin, auth, request, name)
         if by_pin and not origin.device:
             return await page(request, 401, say("login.password_first"))
-        user, wait_s, tried = await identified(auth, origin, name, fields["pin"] if by_pin else secret, by_pin=by_pin)
-        if not tried:
-            return await page(request, 429, say("login.wait", n=ceil(wait_s)), wait_s)
-        visit.target = name if await asyncio.to_thread(auth.people.known, name) else "unknown user"
+        user, wait_s, tried = await identified(auth, origin, name, fields.get("pin" if by_pin else "password", ""), by_pin=by_pin)
+        if tried and await asyncio.to_thread(auth.people.known, name):
+            visit.target = name
         if user is None:
-            return await page(request, 401, say("login.wrong") + (f" {say('login.next', n=ceil(wait_s))}" if wait_s else ""))
+            text = " ".join(say(key, n=ceil(wait_s)) for key in _refusals(wait_s, tried=tried))
+            return await page(request, 401 if tried else 429, text, 0.0 if tried else wait_s)
         visit.who = f"user:{user.name}"
         answer = RedirectResponse("/", 303)
         _set_cookie(auth, request, answer, await asyncio.to_thread(auth.people.begin, user, visit.secret))
@@ -69,6 +69,11 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
             answer.set_cookie(auth.device_cookie(user.name), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
         return answer
 
+    _add_logout(app, auth)
+    _add_reading(app, auth)
+
+
+def _add_logout(app: FastAPI, auth: Authenticator) -> None:
     @app.post("/logout", include_in_schema=False)
     @needs(Permission.READ)
     async def logout(request: Request) -> Response:
@@ -78,8 +83,6 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         answer = RedirectResponse("/login", 303)
         _set_cookie(auth, request, answer, "")
         return answer
-
-    _add_reading(app, auth)
 
 
 async def identified(
@@ -147,6 +150,11 @@ def _login_origin(auth: Authenticator, request: Request, name: str) -> LoginOrig
     visit: Visit = request.state.visit
     device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(name), ""))
     return LoginOrigin(visit.address, device, local=is_local(visit.address) and not auth.behind_tls)
+
+
+def _refusals(wait_s: float, *, tried: bool) -> list[str]:
+    """Keys of the texts that tell a visitor why the login failed."""
+    return ["login.wait"] if not tried else ["login.wrong", "login.next"] if wait_s else ["login.wrong"]
 
 
 def _with_pin_here(auth: Authenticator, request: Request) -> list[str]:

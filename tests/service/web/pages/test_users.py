@@ -1,4 +1,4 @@
-"""Users on the page by HTTP: an admin adds, changes and disables them; each person has an own password and PIN; the audit names what was done."""
+"""Users on the page by HTTP: an admin adds and changes them, each person has an own password and PIN, and the audit says so."""
 
 from __future__ import annotations
 
