@@ -9,7 +9,7 @@ from pathlib import Path
 from types import ModuleType, SimpleNamespace
 
 ROOT = Path(__file__).resolve().parents[2]
-NAMES = ("journal", "operations", "capabilities", "validate", "back", "machine", "execute")
+NAMES = ("journal", "operations", "validate", "back", "machine", "execute")
 """In the order of their imports."""
 OUTSIDE = {"second_decoder": "drivers/second_decoder.py", "one_bank": "drivers/one_bank.py", "codec": "service/tables/nine_tables.py"}
 _counter = itertools.count()

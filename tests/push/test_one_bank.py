@@ -31,7 +31,7 @@ MUTANTS: dict[str, Edits] = {
     "foreign content overwritten": (("back", "if step is not None and _mixed(", "if step is not None or _mixed("),),
     "not restored after an interruption": (("machine", 'if which in ("candidate", "off"):', 'if which == "candidate":'),),
     "a person's switching off overridden": (("machine", 'if which == "off" and isinstance(known.verdict, OperationRefused):', "if False:"),),
-    "unattended at level 1": (("capabilities", "if level in (1, 2):\n        return \"\" if attended else NEEDS_ATTENDANCE", 'if level in (1, 2):\n        return ""'),),
+    "unattended at level 1": (("journal", "if level in (1, 2):\n        return \"\" if attended else NEEDS_ATTENDANCE", 'if level in (1, 2):\n        return ""'),),
     "e-stop not looked at": (("machine", 'return f"not safe now: {truth.unsafe}" if truth.unsafe else ""', 'return ""'),),
     "a refusal after switching off told as nothing changed": (("one_bank", "except Refused as error:\n            raise DeviceFault", "except ZeroDivisionError as error:\n            raise DeviceFault"),),
     "old table not told from another": (("back", "f.crc if in_force(f, truth) != \"off\" else 0", "f.crc"),),
