@@ -6,21 +6,19 @@ Order of precedence: environment (``ABBE_WEB__PORT=9000`` is ``port`` in ``[web]
 from __future__ import annotations
 
 import json
+import os
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal, get_args, get_type_hints
 
 from pydantic import ValidationError
-from pydantic_settings import BaseSettings, EnvSettingsSource, SettingsConfigDict
-from pydantic_settings.exceptions import SettingsError
 
 from abbe.drivers.links.urls import beside
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
 from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.engine import resolve_url
 
 PREFIX = "ABBE_"
 Origin = Literal["default", "file", "environment"]
@@ -37,18 +35,14 @@ class LoadedMachine:
     @property
     def database_url(self) -> str:
         """``[store] url``; a relative SQLite file lies beside the machine file."""
+        from abbe.service.storage.engine import resolve_url
+
         return resolve_url(self.machine.store.url, self.path.resolve().parent)
 
     def values(self) -> list[tuple[str, Any, Origin]]:
         """List effective values as (dotted key, value with secrets masked, origin), in the order of the documentation."""
         found = _leaves(self.machine.model_dump(mode="json"))
         return [(key, mask_secrets(value) if isinstance(value, str) else value, self.origins.get(key, "default")) for key, value in found]
-
-
-class _Environment(MachineFile, BaseSettings):
-    """Defines the environment variables for pydantic-settings; it is never instantiated."""
-
-    model_config = SettingsConfigDict(env_prefix=PREFIX, env_nested_delimiter="__", extra="forbid")
 
 
 def load_machine(path: Path | str) -> LoadedMachine:
@@ -118,23 +112,37 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
 
 
 def _overrides() -> dict[str, Any]:
+    """Values of ``ABBE_KEY`` and ``ABBE_TABLE__KEY``; variables such as ABBE_DB, which name no key, are none of the machine file's."""
+    found: dict[str, Any] = {}
+    for name, text in sorted(os.environ.items()):  # ABBE_WEB before ABBE_WEB__PORT
+        if not name.upper().startswith(PREFIX):
+            continue
+        place = _place(name.upper().removeprefix(PREFIX).split("__"))
+        if place[0] in MachineFile.model_fields:
+            value = _typed(place, text)
+            for part in reversed(place):
+                value = {part: value}
+            found = _merged(found, value)
+    return found
+
+
+def _place(parts: list[str]) -> list[str]:
+    """The keys of a variable, spelled as in the file; an unknown one in small letters."""
+    place, keys = [], _keys(MachineFile)
+    for part in parts:
+        place.append(next((key for key in keys if key.upper() == part), part.lower()))
+        keys = _keys_inside(keys.get(place[-1]))
+    return place
+
+
+def _typed(place: Sequence[str], text: str) -> Any:
     try:
-        return {key: _typed(value) for key, value in EnvSettingsSource(_Environment)().items()}
-    except SettingsError as err:
-        raise ConfigError(
-            f"environment: {mask_secrets(str(err))}", "lists and tables are written as JSON, e.g. ABBE_TOOL_MM='[0,0,120]'"
-        ) from None
-
-
-def _typed(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _typed(inner) for key, inner in value.items()}
-    if isinstance(value, str):
-        try:
-            return json.loads(value)
-        except ValueError:
-            return value
-    return value
+        return json.loads(text)
+    except ValueError:
+        if text.startswith(("[", "{")):
+            hint = "lists and tables are written as JSON, e.g. ABBE_TOOL_MM='[0,0,120]'"
+            raise ConfigError(f"environment: {'.'.join(place)} is not JSON", hint) from None
+        return text
 
 
 def _merged(under: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -180,9 +188,13 @@ def _siblings(location: tuple[int | str, ...]) -> list[str]:
     keys = _keys(MachineFile)
     for part in location[:-1]:
         if str(part) in keys:
-            kind = keys[str(part)]
-            keys = next(found for one in (kind, *get_args(kind)) if (found := _keys(one)))
+            keys = _keys_inside(keys[str(part)])
     return list(keys)
+
+
+def _keys_inside(kind: Any) -> dict[str, Any]:
+    """Return the keys of a table, of an optional table, or of each table of a list."""
+    return next((found for one in (kind, *get_args(kind)) if (found := _keys(one))), {})
 
 
 def _keys(section: Any) -> dict[str, Any]:

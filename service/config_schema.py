@@ -16,7 +16,6 @@ from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
 from abbe.service.push.validate import PushLimits
-from abbe.service.storage.engine import parse_url as parse_database
 
 Positive = Annotated[float, Field(gt=0.0)]
 
@@ -101,6 +100,8 @@ def _check_device(kind: str, text: str) -> None:
 
 
 def _database(text: str) -> str:
+    from abbe.service.storage.engine import parse_url as parse_database  # of sqlalchemy, which no other key needs
+
     try:
         parse_database(text)
     except AbbeError as err:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import errno
+import gc
 import io
 import os
 import sys
@@ -32,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    gc.set_threshold(50_000)  # what imports make stays: searching it for garbage would be a sixth of the start
     try:
         code = run(arguments)
     except KeyboardInterrupt:

@@ -309,9 +309,9 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False,
     moves the machine.
     """
     from abbe.service.cli.running import person_at_console
-    from abbe.service.compensation.proposals import by_whom
     from abbe.service.compensation.recover import recovered_session
     from abbe.service.devices.session import lock_machine
+    from abbe.service.users.account import by_whom
 
     def report(text: str) -> None:
         typer.echo(text, err=True)

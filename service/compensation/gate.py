@@ -21,7 +21,7 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposal_decisions import valid_approval
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposals import by_whom, candidate_context, login, until_s
+from abbe.service.compensation.proposals import candidate_context, until_s
 from abbe.service.compensation.proved_levels import LevelStatus, check_level
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
@@ -45,6 +45,7 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base
+from abbe.service.users.account import by_whom, login
 
 
 @dataclass(frozen=True)

@@ -11,13 +11,13 @@ from datetime import datetime, timedelta
 
 from abbe.service.clock import Clock, utc_text
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.compensation.proposals import login
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import TableRefused
 from abbe.service.push.journal import Journal, facts
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
+from abbe.service.users.account import login
 
 
 @dataclass(frozen=True, slots=True)

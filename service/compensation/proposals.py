@@ -8,8 +8,6 @@ is written to the controller.
 from __future__ import annotations
 
 import asyncio
-import getpass
-import os
 import secrets
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
@@ -44,6 +42,7 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, added, read_base, tables_from_image
 from abbe.service.tables.push_journal import JournalView
+from abbe.service.users.account import login
 
 SIGNER = "metrologist"
 MONTH = timedelta(days=30)
@@ -367,19 +366,6 @@ def check_certificates(site: Site) -> None:
         raise TableRefused(
             "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
         )
-
-
-def login() -> str:
-    """The account that runs this command line."""
-    try:
-        return getpass.getuser()
-    except (KeyError, OSError):  # a service account without a name
-        return f"user {os.getuid()}"
-
-
-def by_whom() -> str:
-    """The account that orders a table from this command line, as the journal names it."""
-    return f"{login()}, by the command line"
 
 
 async def load_runs(store: Store, run_ids: list[int]) -> list[Run]:

@@ -27,8 +27,9 @@ from abbe.service.push.journal import NO_PUSH, Journal, StoreBook, facts
 from abbe.service.push.operations import Done, Operation, OperationKind, Outcome, Truth, Unanswered
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
+from abbe.service.tables.known_tables import KnownTables, known_tables
 from abbe.service.tables.push_journal import operator_needed
-from abbe.service.tables.table_gate import KnownTables, accept_strange, acceptance_doc, check_in_force, known_tables, vouch
+from abbe.service.tables.table_gate import accept_strange, acceptance_doc, check_in_force, vouch
 
 READY = "make the machine ready (interlocks, link), then start again"
 

@@ -16,7 +16,6 @@ from abbe.drivers.errors import DriverError
 from abbe.drivers.tables import crc32
 from abbe.service.clock import Clock
 from abbe.service.compensation.commission import check_commissioned
-from abbe.service.compensation.proposals import by_whom
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
 from abbe.service.compensation.recover import LIMIT_S, finish_when_safe, recover, with_notes
 from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
@@ -28,9 +27,10 @@ from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
+from abbe.service.tables.known_tables import unverified_crcs
 from abbe.service.tables.nine_tables import Base, read_base
 from abbe.service.tables.push_journal import KIND, STOPPED, JournalView, ended_as
-from abbe.service.tables.table_gate import unverified_crcs
+from abbe.service.users.account import by_whom
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,9 +21,10 @@ from abbe.service.scheduler.loop import AlarmSink
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables import table_gate
+from abbe.service.tables.known_tables import KnownTables, known_tables
 from abbe.service.tables.push_journal import JournalView
 from abbe.service.tables.table_gate import STRANGE as STRANGE_TABLE
-from abbe.service.tables.table_gate import InForceNow, KnownTables, known_tables
+from abbe.service.tables.table_gate import InForceNow
 from abbe.service.verification.verified_by import STRANGE_TABLE as STRANGE_TABLE_CODE
 
 

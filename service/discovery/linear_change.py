@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import math
+from typing import TYPE_CHECKING
 
-from abbe.service.compensation.proposals import StoredProposal
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import Unusable
 from abbe.service.storage.store import Store
+
+if TYPE_CHECKING:
+    from abbe.service.compensation.proposals import StoredProposal
 
 NAMES = {
     "EXX": "scale of X",

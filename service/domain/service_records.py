@@ -3,12 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from datetime import datetime
+from datetime import datetime, timedelta
 from enum import StrEnum
 
 from abbe.service.domain.document import Doc, HistoryLine, Row
 from abbe.service.domain.measured import Owner
 from abbe.service.domain.verification import CheckFailure
+
+BEAT_S = 60.0
+"""Time between two heartbeats of a service, s."""
+SILENT_AFTER = timedelta(seconds=3 * BEAT_S)
+"""A service on another computer counts as not running after this silence."""
 
 
 class AlarmKind(StrEnum):

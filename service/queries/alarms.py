@@ -12,8 +12,9 @@ from typing import Literal, TypeVar
 
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
 from abbe.service.errors import JournalChanged
+from abbe.service.queries.checks import checks
 from abbe.service.queries.reader import Reader, StoredResult
-from abbe.service.queries.results import DiscoverySummary, checks, discoveries
+from abbe.service.queries.results import DiscoverySummary, discoveries
 from abbe.service.queries.status import AlarmSummary, summaries
 from abbe.service.queries.tables import ProposalSummary, proposals, tables
 from abbe.service.storage.store import Store

@@ -8,8 +8,7 @@ from datetime import datetime
 from typing import Any
 
 from abbe.service.domain.results import VerificationRecord
-from abbe.service.domain.service_records import HeartbeatRecord
-from abbe.service.scheduler.heartbeat import SILENT_AFTER
+from abbe.service.domain.service_records import SILENT_AFTER, HeartbeatRecord
 from abbe.service.storage.store import Store
 from abbe.service.verification.trend_table import FigureTrend, trends
 from abbe.service.verification.verified_by import LATEST_CHECKS, VerifiedBy, of_push_taken_back, verified_by

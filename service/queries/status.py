@@ -12,8 +12,8 @@ from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmKind
 from abbe.service.domain.verification import Verification
+from abbe.service.queries.checks import latest_checks
 from abbe.service.queries.reader import Reader
-from abbe.service.queries.results import latest_checks
 from abbe.service.queries.timetable import NextDue, next_due
 from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import Alarm, AlarmHead, folded, is_open

@@ -9,8 +9,9 @@ from abbe.service.domain.run import Run, RunTable
 from abbe.service.rendering.document import Sign
 from abbe.service.runs.exchange import Images
 from abbe.service.storage.store import Store
+from abbe.service.tables.known_tables import KnownTables, known_tables
 from abbe.service.tables.measured_with import KIND_AT, NO_CORRECTION, images_of
-from abbe.service.tables.table_gate import STRANGE, KnownTables, known_tables
+from abbe.service.tables.table_gate import STRANGE
 
 WORD = "Unverified table"
 

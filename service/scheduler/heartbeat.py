@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Callable, Sequence
-from datetime import datetime, timedelta
+from datetime import datetime
 from typing import Protocol
 
 import structlog
@@ -12,15 +12,12 @@ import structlog
 from abbe.service.clock import Clock
 from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import BEAT_S
 from abbe.service.errors import StoreError
 from abbe.service.scheduler.ports import Doc
 
 log = structlog.get_logger("abbe.station")
 
-BEAT_S = 60.0
-"""Time between two heartbeats, s."""
-SILENT_AFTER = timedelta(seconds=3 * BEAT_S)
-"""A service on another computer counts as not running after this silence."""
 MEASURING = "measuring"
 WAITING = "waiting"
 

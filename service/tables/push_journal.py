@@ -16,7 +16,7 @@ from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntr
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
 from abbe.service.push.journal import NO_PUSH, NOT_YET, Journal, JournalBroken, PushFacts, check_chain, facts
 from abbe.service.storage.store import Store
-from abbe.service.tables.table_gate import PushedTable, known_tables
+from abbe.service.tables.known_tables import PushedTable, known_tables
 
 KIND = "rollback"
 """Kind of a table that a person restored by an ordered rollback."""

@@ -161,11 +161,23 @@ def test_no_source_file_is_longer_than_600_lines() -> None:
 HEAVY = {"numpy", "scipy", "sqlalchemy", "alembic", "fastapi", "pymodbus", "serial", "aiomqtt", "structlog"}
 STARTS = {"--help": HEAVY | {"pydantic"}, "version": HEAVY, "device list": HEAVY, "effects backlash": HEAVY - {"numpy", "scipy"}}
 """What a command must not import."""
+OPENED = HEAVY - {"numpy", "sqlalchemy"} | {"rich"}
+OPENS = {
+    "runs": OPENED,
+    "show x": OPENED,
+    "user list": OPENED,
+    "audit show": OPENED,
+    "backup copy": OPENED,
+    "check-config": {"fastapi", "alembic", "aiomqtt", "structlog", "rich"},
+} | dict.fromkeys(("trend", "fleet", "alarm list", "comp show", "model list", "model show"), OPENED - {"scipy"})
+"""The same of commands that only read; of scipy, a trend needs nothing but `scipy.special`."""
+SOLVING = {"abbe.service.identification.solve", "abbe.service.discovery.discover", "scipy.linalg", "scipy.optimize", "scipy.stats"}
+"""What only computing commands import."""
 
 
-def modules(*words: str) -> set[str]:
-    """What a Python imports in whole, as `-X importtime` says."""
-    run = subprocess.run([sys.executable, "-X", "importtime", *words], cwd=ROOT, check=True, capture_output=True, text=True)
+def modules(*words: str, folder: Path = ROOT, fails: bool = False) -> set[str]:
+    """What a Python imports in whole, as `-X importtime` says; ``fails``: the command may end with an error."""
+    run = subprocess.run([sys.executable, "-X", "importtime", *words], cwd=folder, check=not fails, capture_output=True, text=True)
     return {line.rpartition("|")[2].strip() for line in run.stderr.splitlines() if line.startswith("import time:")}
 
 
@@ -175,6 +187,17 @@ def test_a_command_that_computes_nothing_comes_at_once(words: str) -> None:
     loaded = {name.partition(".")[0] for name in modules(tool("abbe"), *words.split())}
     assert "typer" in loaded
     assert not loaded & STARTS[words]
+
+
+@pytest.mark.parametrize("words", OPENS)
+def test_a_command_that_only_reads_the_database_comes_soon(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ABBE_DB", raising=False)
+    (tmp_path / "abbe.toml").write_text('name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY = [0, 400]\nZ = [-300, 0]\n')
+    Store.open(f"sqlite:///{tmp_path}/abbe.sqlite3").close()
+    loaded = modules(tool("abbe"), *words.split(), folder=tmp_path, fails=True)
+    assert "abbe.service.config" in loaded
+    assert not {name.partition(".")[0] for name in loaded} & OPENS[words]
+    assert not loaded & SOLVING
 
 
 def test_an_idle_service_holds_no_library_of_mathematics() -> None:

@@ -25,10 +25,10 @@ from abbe.service.push.operations import VerificationResult
 from abbe.service.report.report_table import table_remarks
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
+from abbe.service.tables.known_tables import known_tables
 from abbe.service.tables.measured_with import KIND_AT
 from abbe.service.tables.nine_tables import read_base
 from abbe.service.tables.push_journal import JournalView, open_pushes
-from abbe.service.tables.table_gate import known_tables
 from abbe.service.verification.verified_by import verified_by
 from tests.faults.sequencer_world import Bench, bench
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed

@@ -20,7 +20,7 @@ from abbe.service.compensation.correct import Correction, push
 from abbe.service.compensation.gate import PushContext, admit, precheck
 from abbe.service.compensation.proposal_decisions import approve, proposal_status, status_of_proposal
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
-from abbe.service.compensation.proposals import load_runs, login
+from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved, push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
@@ -32,6 +32,7 @@ from abbe.service.sequences.control import Control, Watching
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
+from abbe.service.users.account import login
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import registers

@@ -62,6 +62,15 @@ def test_values_and_defaults(file: Path) -> None:
     assert loaded.database_url == f"sqlite:///{file.parent / 'abbe.sqlite3'}"
 
 
+def test_a_variable_spells_its_keys_in_any_case(file: Path, clean_environment: pytest.MonkeyPatch) -> None:
+    clean_environment.setenv("ABBE_STROKE_MM__X", "[0, 450]")
+    clean_environment.setenv("ABBE_WEB", '{"port": 1, "host": "127.0.0.2"}')
+    clean_environment.setenv("abbe_web__port", "9000")
+    clean_environment.setenv("ABBE_DB", "none of the file's keys")
+    machine = load_machine(file).machine
+    assert (machine.stroke_mm.X, machine.web.port, machine.web.host) == ((0.0, 450.0), 9000, "127.0.0.2")
+
+
 def test_origins_and_masked_secrets(file: Path, clean_environment: pytest.MonkeyPatch) -> None:
     clean_environment.setenv("ABBE_WEB__PORT", "9000")
     clean_environment.setenv("ABBE_TOOL_MM", "[0, 0, 5]")

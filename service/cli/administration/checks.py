@@ -53,8 +53,8 @@ def acknowledge(
     as_json: JsonOption = False,
 ) -> None:
     """Note that a person has seen an alarm. The alarm stays active until a check clears it."""
-    from abbe.service.compensation.proposals import login
     from abbe.service.config import load_machine
+    from abbe.service.users.account import login
     from abbe.service.verification.alarms import acknowledge as work
 
     loaded = load_machine(machine_file(machine))
@@ -105,8 +105,8 @@ def trend(
 ) -> None:
     """Show whether each judged figure is in control or drifts (since when), and the days until its limit, with their uncertainty."""
     from abbe.service.cli.common import reader_of
+    from abbe.service.queries.checks import trends
     from abbe.service.queries.reader import json_value
-    from abbe.service.queries.results import trends
     from abbe.service.verification.trend_table import HEADINGS, chart, row
     from abbe.service.verification.verified_by import measure_now
 

@@ -185,9 +185,9 @@ def approve(
     """Approve exactly this table, in place of exactly the present one, for this machine and its limits (exit code 1: not approved)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import approve as work_approve
-    from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
     from abbe.service.tables.push_journal import open_pushes
+    from abbe.service.users.account import login
 
     with open_store(database_url(db, machine)) as store:
         try:
@@ -226,9 +226,9 @@ def reject(
     """Reject a proposal permanently: it cannot be approved or pushed (exit code 1: it cannot be rejected any more)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import reject as work_reject
-    from abbe.service.compensation.proposals import login
     from abbe.service.errors import TableRefused
     from abbe.service.queries import tables
+    from abbe.service.users.account import login
 
     with open_store(database_url(db, machine)) as store:
         try:

@@ -13,6 +13,7 @@ from pydantic import BeforeValidator
 
 from abbe.service.domain.verification import Verification
 from abbe.service.errors import NotStored
+from abbe.service.queries import checks as check_queries
 from abbe.service.queries import results
 from abbe.service.queries.reader import as_stored, storable
 from abbe.service.rendering.document import Document
@@ -93,23 +94,23 @@ def _add_checks(app: FastAPI, sources: Sources) -> None:
     @needs(Permission.READ)
     def checks(machine: Filter = None, verdict: Filter = None, cursor: Cursor = None, limit: Limit = 50) -> CheckList:
         """Checks of all machines of the store, newest first."""
-        found, after = results.checks(sources.reader, machine, verdict, cursor, limit)
+        found, after = check_queries.checks(sources.reader, machine, verdict, cursor, limit)
         return CheckList(verifications=found, next_cursor=after)
 
     @app.get("/api/v1/checks/{number}")
     @needs(Permission.READ)
     def check(number: Number) -> Verification:
         """One check: figures with uncertainties (k = 2), limits, verdict."""
-        return results.check(sources.reader, number)
+        return check_queries.check(sources.reader, number)
 
     @app.get("/api/v1/trends")
     @needs(Permission.READ)
     def trends(
         machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None, after: After = None
-    ) -> results.Trends:
+    ) -> check_queries.Trends:
         """Whether the figures of the checks drift, since when, and when they reach their limits."""
         since = after.replace(tzinfo=UTC) if after is not None and after.tzinfo is None else after
-        return results.trends(sources.reader, sources.reader.machine if machine is None else machine, since)
+        return check_queries.trends(sources.reader, sources.reader.machine if machine is None else machine, since)
 
 
 AT_A_TIME = 2

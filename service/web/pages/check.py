@@ -14,9 +14,9 @@ from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.verification import CheckFigure, Verification
 from abbe.service.errors import AbbeError, NotStored
 from abbe.service.queries.alarms import AlarmPath, alarms_of_check, path_with
+from abbe.service.queries.checks import check as stored_check
+from abbe.service.queries.checks import checks
 from abbe.service.queries.reader import Reader
-from abbe.service.queries.results import check as stored_check
-from abbe.service.queries.results import checks
 from abbe.service.queries.status import AlarmSummary
 from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.plots.curves import overlay_plot

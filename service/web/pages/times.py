@@ -13,8 +13,8 @@ from abbe.models.trend import CUSUM_H
 from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import SlotRecord
 from abbe.service.domain.verification import Verification
+from abbe.service.queries.checks import charts
 from abbe.service.queries.reader import Reader
-from abbe.service.queries.results import charts
 from abbe.service.queries.status import AlarmSummary, Status, alarms
 from abbe.service.queries.timetable import NextDue, past_slots
 from abbe.service.rendering.numbers import with_uncertainty

@@ -81,8 +81,8 @@ MUTANTS = (
     Mutant("active bank after ACTIVATE not asked (driver)", "drivers/cnc/banks.py", "if active != bank:", "if False:", (BANKS + "::test_acknowledged_but_not_active_is_a_fault",)),
     Mutant("active bank after ACTIVATE not asked (push)", MACHINE, '(in_force(f, known.start) != "candidate" or known.start.boot', "(known.start.boot", (SINGLE,)),
     Mutant("an unverified table in force is not refused", "service/tables/table_gate.py", "    if now.unverified is not None:\n        whose", "    if False:\n        whose", (UNVERIFIED,)),
-    Mutant("no table is unverified", "service/tables/table_gate.py", "if crc not in endorsed}", "if False}", (UNVERIFIED,)),
-    Mutant("a table that once was a base is fine", "service/tables/table_gate.py", "            if base not in candidates:\n", "            if True:\n", (UNVERIFIED,)),
-    Mutant("a kept table is unverified", "service/tables/table_gate.py", "endorsed.add(pushed[push])", "endorsed.discard(pushed[push])", (UNVERIFIED,)),
-    Mutant("a table that a person vouched for is unverified", "service/tables/table_gate.py", "endorsed.add(known.accepted_crc)", "endorsed.discard(known.accepted_crc)", (UNVERIFIED,)),
+    Mutant("no table is unverified", "service/tables/known_tables.py", "if crc not in endorsed}", "if False}", (UNVERIFIED,)),
+    Mutant("a table that once was a base is fine", "service/tables/known_tables.py", "            if base not in candidates:\n", "            if True:\n", (UNVERIFIED,)),
+    Mutant("a kept table is unverified", "service/tables/known_tables.py", "endorsed.add(pushed[push])", "endorsed.discard(pushed[push])", (UNVERIFIED,)),
+    Mutant("a table that a person vouched for is unverified", "service/tables/known_tables.py", "endorsed.add(known.accepted_crc)", "endorsed.discard(known.accepted_crc)", (UNVERIFIED,)),
 )  # fmt: skip

@@ -10,8 +10,8 @@ import pytest
 from abbe.service.core.board import Board
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.domain.schedule import Schedule
+from abbe.service.queries.checks import check, checks, trends
 from abbe.service.queries.reader import Reader, json_value
-from abbe.service.queries.results import check, checks, trends
 from abbe.service.queries.status import Status, StatusReader
 from abbe.service.queries.timetable import schedule_state, span
 from tests.service.web.api_bench import CHECKS, Plant
