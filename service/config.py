@@ -5,23 +5,25 @@ Order of precedence: environment (``ABBE_WEB__PORT=9000`` is ``port`` in ``[web]
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Literal, get_args, get_type_hints
+from typing import Any, get_args, get_type_hints
 
 from pydantic import ValidationError
 
 from abbe.drivers.links.urls import beside
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
+from abbe.service.domain.bounds import TEXT, WORD
+from abbe.service.domain.machine_file import MachineFileSummary, Origin, StatedValue
 from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.secrets import mask_secrets
 
 PREFIX = "ABBE_"
-Origin = Literal["default", "file", "environment"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,6 +45,16 @@ class LoadedMachine:
         """List effective values as (dotted key, value with secrets masked, origin), in the order of the documentation."""
         found = _leaves(self.machine.model_dump(mode="json"))
         return [(key, mask_secrets(value) if isinstance(value, str) else value, self.origins.get(key, "default")) for key, value in found]
+
+    def summary(self) -> MachineFileSummary:
+        """The values for the page, with their lines in the file as it is now."""
+        body = self.path.read_bytes()
+        lines = key_lines(body.decode("utf-8", "replace"))
+        stated = tuple(
+            StatedValue(key[:WORD], json.dumps(value, ensure_ascii=False)[:TEXT], origin, lines.get(key, 0) if origin == "file" else 0)
+            for key, value, origin in self.values()
+        )
+        return MachineFileSummary(str(self.path.resolve())[:TEXT], hashlib.sha256(body).hexdigest(), stated)
 
 
 def load_machine(path: Path | str) -> LoadedMachine:
@@ -109,6 +121,24 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
         raise ConfigError(f"{path}: nested too deeply", "correct the file") from None
     except ValueError:
         raise ConfigError(f"{path}: an integer has thousands of digits", "correct the file") from None
+
+
+def key_lines(text: str) -> dict[str, int]:
+    """Number of the line, from 1, on which each key of a TOML text begins.
+
+    The beginning of a text up to a line is TOML if and only if no value is open at its end, so the library itself finds the lines.
+    """
+    found: dict[str, int] = {}
+    lines, begun = text.split("\n"), 1
+    for end in range(1, len(lines) + 1):
+        try:
+            values = tomllib.loads("\n".join(lines[:end]))
+        except tomllib.TOMLDecodeError:
+            continue
+        for key, _ in _leaves(values):
+            found.setdefault(key, begun)
+        begun = end + 1
+    return found
 
 
 def _overrides() -> dict[str, Any]:

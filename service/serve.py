@@ -113,6 +113,7 @@ class Service:
         self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
         self._opcua = self._make_opcua()
         doc = {"host": setup.web.host, "port": listening.getsockname()[1]}
+        doc |= {} if setup.stated is None else {"machine_file": setup.stated.path, "sha256": setup.stated.sha256}
         book.write(AuditEvent(who=this_account(), action="abbe serve", target=setup.machine, outcome="begun", doc=doc))
 
     def _begin(self, recipes: tuple[str, ...]) -> Begin:
@@ -139,6 +140,7 @@ class Service:
             setup.web.memory_mb,
             setup.control,
             self._pushes_itself,
+            setup.stated,
         )
 
     def _changed(self) -> None:

@@ -27,10 +27,12 @@ from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.clock import SystemClock, utc_text
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
 from abbe.service.compensation.proposals import Promise, candidate_of
+from abbe.service.config import load_machine
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.domain.machine import Rules
+from abbe.service.domain.machine_file import MachineFileSummary
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind, Signal
@@ -261,6 +263,42 @@ class Served:
     tail: LogTail
 
 
+MACHINE_FILE = """\
+name = "mill-7"
+chain = "w-X-Y-b-Z-t"
+[stroke_mm]
+X = [0, 500]
+Y = [0, 400]
+Z = [-300, 0]
+
+[limits]
+table_value_um = 80.0   # the line that a person has to change
+[devices]
+laser = "modbus+tcp://127.0.0.1:5021"
+[calibration]
+laser = 2027-05-31
+[issuer]
+laboratory = "Gauge room"
+city = "Bonn"
+country = "DE"
+person = "A. Probst"
+[[schedule]]
+name = "weekly"
+cron = "0 6 * * 1"
+timezone = "Europe/Berlin"
+recipe = "quick-check"
+[mqtt]
+url = "mqtt://ann:secret@127.0.0.1:1883"
+"""
+
+
+def _stated(filled: Filled) -> MachineFileSummary:
+    """A machine file as the service has read it."""
+    path = Path(filled.url.removeprefix("sqlite:///")).parent / "machine.toml"
+    path.write_text(MACHINE_FILE)
+    return load_machine(path).summary()
+
+
 @contextmanager
 def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
     """The page over a filled store, on a real socket, in a thread with its own event loop."""
@@ -276,7 +314,9 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         view = StatusReader(Reader(store, filled.machine, clock), "0.1.0", board, lambda: [(s, soon) for s in filled.schedules], "")
         tail = LogTail()
         rules = Rules({"circularity": 20.0}, {"ballbar": (soon + timedelta(days=90)).date(), "laser": date(2026, 1, 1)})
-        sources = Sources(reader=view.reader, schedules=filled.schedules, devices=lambda: board.devices, rules=rules, tail=tail)
+        sources = Sources(
+            reader=view.reader, schedules=filled.schedules, devices=lambda: board.devices, rules=rules, tail=tail, stated=_stated(filled)
+        )
         listening = bind("127.0.0.1", 0)
         server = make_server(create_app(view, version="0.1.0", auth=auth, api=sources))
         thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])))

@@ -21,6 +21,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import MachineObject, Rules
+from abbe.service.domain.machine_file import MachineFileSummary
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
@@ -72,6 +73,7 @@ class Begin:
     memory_mb: Annotated[int, Field(ge=1)]
     control: Text
     pushes_itself: bool
+    stated: MachineFileSummary | None
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
 from abbe.service.core.table_watch import LookAtTable
 from abbe.service.domain.machine import Rules, control_of
+from abbe.service.domain.machine_file import MachineFileSummary
 from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.mqtt.broker import Broker, Topics
 from abbe.service.scheduler.alarm_manager import Duties
@@ -96,6 +97,8 @@ class ServiceSetup:
     actions: Callable[[Store], OrderActions] | None = None
     campaigns: tuple[str, ...] = ()
     campaign: Callable[[Store], MeasureCampaign] | None = None
+    stated: MachineFileSummary | None = None
+    """The machine file, for the page that shows it."""
     warnings: tuple[str, ...] = ()
     """Unusual but possible values of the machine file: logged once the service is up."""
 

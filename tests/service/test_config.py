@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.config import load_machine
+from abbe.service.config import key_lines, load_machine
 from abbe.service.errors import ConfigError
 
 GOOD = """
@@ -209,3 +209,9 @@ def test_toml_that_no_parser_takes_is_one_line(tmp_path, text, says):
     path.write_text(text)
     with pytest.raises(ConfigError, match=says):
         load_machine(path)
+
+
+def test_every_key_has_the_line_on_which_it_begins() -> None:
+    text = 'a = 1\n\n[b]\nlong = [\n  1,\n  2,\n]\nsaid = """\nc = 5\n"""\ninline = {x = 1, y = 2}\n[[d]]\ne = 1\n# e = 2\n[[d]]\ne = 3\n'
+    lines = {"a": 1, "b.long": 4, "b.said": 8, "b.inline.x": 11, "b.inline.y": 11, "d[1].e": 13, "d[2].e": 16}
+    assert key_lines(text) == lines

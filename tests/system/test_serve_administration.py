@@ -48,7 +48,7 @@ def test_the_screens_of_an_admin_fit_and_are_quiet(chromium: Browser, running: S
         watch = Watch(page, running.base)
         log_in(page, running.base, "adam")
         bad = []
-        for path in ("/users", "/user?name=olga", "/settings"):
+        for path in ("/users", "/user?name=olga", "/settings", "/machine"):
             page.goto(running.base + path)
             page.wait_for_selector("html[data-ready=yes]")
             bad += faults(page, axe, f"{path.strip('/').partition('?')[0]}-{size}-{scheme}-{lang}")

@@ -124,6 +124,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         actions=None if site.urls.cnc is None else order_actions_on(config.alarm, site),
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
+        stated=loaded.summary(),
         warnings=check_plausibility(config, folder, SystemClock().utc().date()).warnings,
     )
 

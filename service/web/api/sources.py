@@ -9,6 +9,7 @@ from typing import Annotated
 from fastapi import Path, Query
 
 from abbe.service.domain.machine import Rules
+from abbe.service.domain.machine_file import MachineFileSummary
 from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.schedule import Schedule
 from abbe.service.queries.reader import Reader
@@ -26,7 +27,7 @@ class Sources:
     """Sources of the data behind `/api/v1`.
 
     ``devices`` returns the devices with their last state; ``rules``: limits and certificates of the machine file; ``tail``: the latest log
-    lines, for the diagnostics.
+    lines, for the diagnostics; ``stated``: the machine file with its lines.
     """
 
     reader: Reader
@@ -34,3 +35,4 @@ class Sources:
     devices: Callable[[], Sequence[DeviceStatus]] = tuple
     rules: Rules = field(default_factory=Rules)
     tail: LogTail | None = None
+    stated: MachineFileSummary | None = None

@@ -260,6 +260,12 @@ def _add_settings(app: FastAPI, context: PageContext, sources: Sources) -> None:
         by_pin = own is not None and own.role in PIN_ROLES
         return await context.show("settings.html", themes=THEMES, systems=SYSTEMS, names=language.NAMES, own=own, by_pin=by_pin)
 
+    @app.get("/machine", include_in_schema=False)
+    @needs(Permission.CONFIGURE)
+    async def machine() -> HTMLResponse:
+        stated = sources.stated
+        return await context.show("machine.html", stated=stated, sections={} if stated is None else stated.sections())
+
     @app.get("/diagnostics", include_in_schema=False)
     @needs(Permission.CONFIGURE)
     async def diagnostics() -> HTMLResponse:

@@ -146,6 +146,7 @@ async def _serve(wire: Wire, begin: Begin, store: Store, listening: socket.socke
         devices=lambda: core.devices,
         rules=begin.rules,
         tail=capture_log(),
+        stated=begin.stated,
     )
     app = create_app(view, version=begin.version, hosts=begin.hosts, auth=auth, parts=parts, plant=plant, api=api)
     server = make_server(app, begin.certificate, begin.key)

@@ -23,6 +23,7 @@ from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject, Rules
+from abbe.service.domain.machine_file import MachineFileSummary, StatedValue
 from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
@@ -95,6 +96,7 @@ CORE = [
         1024,
         "modbus+tcp://127.0.0.1:502",
         True,
+        MachineFileSummary("/etc/abbe/mill.toml", "ab" * 32, (StatedValue("limits.table_value_um", "80.0", "file", 12),)),
     ),
     MOMENT,
     m.Jobs("jobs", (JOB, replace(JOB, ended_utc=NOW, verification=7))),

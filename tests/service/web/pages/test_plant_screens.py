@@ -87,7 +87,7 @@ def test_who_sees_users_and_diagnostics(running: Served) -> None:
         with as_user(running, name) as client:
             assert ("petra" in client.get("/users").text) == admin
             assert "petra" not in client.get("/settings").text
-            for path in ("/diagnostics", "/support.zip"):
+            for path in ("/diagnostics", "/support.zip", "/machine"):
                 assert client.get(path).status_code == (200 if admin else 403), (name, path)
 
 
@@ -196,3 +196,16 @@ async def test_a_screen_that_is_not_there_is_not_in_the_bar(running: Served) -> 
 def test_nobody_without_a_session_gets_the_bundle(running: Served) -> None:
     with httpx.Client(base_url=running.base) as client:
         assert {client.get(path).status_code for path in ("/support.zip", "/diagnostics", "/fleet.csv", "/fleet", "/devices")} == {401}
+
+
+def test_the_machine_file_is_shown_with_its_lines_and_no_secret(running: Served) -> None:
+    with as_user(running, "adam") as client:
+        page = client.get("/machine").text
+    rows = dict(re.findall(r"<code>([^<]+)</code></th><td[^>]*>([^<]+)</td>", page))
+    assert rows["limits.table_value_um"] == "line 9"
+    assert rows["limits.table_change_um"] == "default"
+    assert rows["calibration.laser"] == "line 13"
+    assert rows["issuer.laboratory"] == "line 15"
+    assert rows["schedule[1].cron"] == "line 21"
+    assert "secret" not in page
+    assert "machine.toml" in page
