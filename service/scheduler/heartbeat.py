@@ -16,7 +16,7 @@ from abbe.service.domain.service_records import BEAT_S
 from abbe.service.errors import StoreError
 from abbe.service.scheduler.ports import Doc
 
-log = structlog.get_logger("abbe.station")
+log = structlog.get_logger("abbe.heartbeat")
 
 MEASURING = "measuring"
 WAITING = "waiting"

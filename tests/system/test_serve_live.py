@@ -227,8 +227,8 @@ def stop_elsewhere(page: Page, one: Serving) -> None:
     other.wait_for_selector("#lost:visible", timeout=10_000)
     assert "Stop still works" in other.inner_text("#lost")
     other.click("#stop")
-    other.wait_for_selector("#stop-told:not(:empty)")
-    assert other.inner_text("#stop-told").startswith("Stopping")
+    other.wait_for_selector("#stop-answer:not(:empty)")
+    assert other.inner_text("#stop-answer").startswith("Stopping")
     other.close()
 
 

@@ -101,7 +101,7 @@ def _screen(stored: StoredField, campaign: str, query: VolumeQuery, found: NodeM
     level = placed(float(levels[at]), place)
     texts = SliceTexts(
         translate("volume.slice", plane=query.plane, axis="XYZ"[third], at=level, unit=place.sign),
-        translate("volume.nominal"), translate("volume.actual"), translate("volume.untold_key"),
+        translate("volume.nominal"), translate("volume.actual"), translate("volume.not_known"),
         translate("volume.magnified", n=tidy(magnified)), place, error,
     )  # fmt: skip
     cut = _slice(found, query.plane, at)

@@ -69,18 +69,18 @@ async function showBar(status) {
   const answer = await ask("/strip", false);
   if (!answer.ok) return;
   const page = new DOMParser().parseFromString(await answer.text(), "text/html");
-  const told = document.getElementById("stop-told");
+  const kept = document.getElementById("stop-answer");
   document.getElementById("machine-bar").replaceWith(page.getElementById("machine-bar"));
-  if (told) document.getElementById("stop-told")?.replaceWith(told);
+  if (kept) document.getElementById("stop-answer")?.replaceWith(kept);
   shownBar = next;
 }
 
 // Stop stays in its place and works with a session that has run out; the answer stands beside it.
 async function stop(button) {
-  const told = (text) => setText("stop-told", text);
+  const show = (text) => setText("stop-answer", text);
   const answer = await fetch("/api/v1/stop", { method: "POST", headers: { "X-CSRF-Token": button.dataset.csrf } }).catch(() => null);
-  if (answer?.ok) told(words["strip.stopped"]);
-  else told(answer?.status === 409 ? words["strip.nothing"] : words["strip.failed"]);
+  if (answer?.ok) show(words["strip.stopped"]);
+  else show(answer?.status === 409 ? words["strip.nothing"] : words["strip.failed"]);
 }
 
 document.addEventListener("click", (event) => {

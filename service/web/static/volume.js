@@ -32,7 +32,7 @@ function rounded(value, expanded) {
 function sentence(map, k, words) {
   const [d, u] = [map.deviation[k], map.expanded[k]];
   const parts = { x: d[0], y: d[1], z: d[2] };
-  let text = words[map.significant[k] ? "told" : "untold"].replace("{place}", map.at[k].join(", "));
+  let text = words[map.significant[k] ? "significant" : "notSignificant"].replace("{place}", map.at[k].join(", "));
   Object.entries(parts).forEach(([name, value], i) => { text = text.replace(`{${name}}`, `${rounded(value, u[i])} ± ${rounded(u[i], u[i])}`); });
   text = text.replace("{length}", rounded(map.length[k], u[3])).replace("{u}", rounded(u[3], u[3]));
   return text.replaceAll("{unit}", unit.error).replaceAll("{place_unit}", unit.place);
