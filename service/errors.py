@@ -40,7 +40,7 @@ class ConfigError(AbbeError):
 
 
 class FileFormatError(AbbeError):
-    """An exchange file violates its format (docs/reference/formats.md); the message names file, key, row and the expected value."""
+    """An exchange file violates its format (docs/schemas, docs/reference); the message names file, key, row and the expected value."""
 
     code = "FMT-001"
 

@@ -191,7 +191,7 @@ class Straightened:
 
 @dataclass(frozen=True, eq=False)
 class ErrorMotions:
-    """Error motions as functions of the axis positions (file format ``abbe-errors/1``, docs/reference/formats.md).
+    """Error motions as functions of the axis positions (file format ``abbe-errors/1``, docs/how-to/errors.md).
 
     Squareness multiplies the travel from AXIS ZERO. `abbe.models.geometry.bases` counts from the start of the stroke; the two differ by a
     constant offset of the whole map.

@@ -146,11 +146,13 @@ def column_file(path: Path) -> ColumnFile:
     try:
         return ColumnFile.model_validate(tomllib.loads(read_bytes(path).decode("utf-8")))
     except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
-        raise FileFormatError(f"{path}: not valid TOML: {err}", "see docs/how-to/import.md") from None
+        raise FileFormatError(f"{path}: not valid TOML: {err}", "see docs/reference/instrument-files.md") from None
     except ValidationError as err:
         first = mistakes(err.errors())[0]
         place = location_text(first.place)
-        raise FileFormatError(f"{path}: {f'{place}: ' if place else ''}{first.expected}", "see docs/how-to/import.md") from None
+        raise FileFormatError(
+            f"{path}: {f'{place}: ' if place else ''}{first.expected}", "see docs/reference/instrument-files.md"
+        ) from None
 
 
 def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> FileRows:

@@ -1,7 +1,7 @@
 """Lists of an artefact's points as a campaign: CSV files with named columns, one pose each, and reports of plug plates from a CMM.
 
-A CSV file has lines ``# key: value`` (`HEAD`, docs/how-to/artefact.md) above its header. Its columns are those of a run of an artefact and
-``nominal_x_mm`` .. of the features; without columns ``deviation_..`` these are computed from the positions that were found.
+A CSV file has lines ``# key: value`` (`HEAD`, docs/reference/instrument-files.md) above its header. Its columns are those of a run of an
+artefact and ``nominal_x_mm`` .. of the features; without columns ``deviation_..`` these are computed from the positions that were found.
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def _table(file: TextFile, lines: list[tuple[int, str]]) -> PointList:
     names = rows[0][1]
     for key in ("feature", *NOMINAL[:2], *PLACES):
         if key not in names:
-            raise file.wrong(rows[0][0], f"column {key!r} is missing", "add it; docs/how-to/artefact.md has an example")
+            raise file.wrong(rows[0][0], f"column {key!r} is missing", "add it; docs/reference/instrument-files.md has an example")
     for n, row in rows[1:]:
         if len(row) != len(names):
             raise file.wrong(n, f"{len(row)} values for {len(names)} columns", "correct the row")

@@ -46,7 +46,7 @@ def read_file(path: Path, columns: ColumnFile | None = None) -> Content:
     if is_table(path):
         if columns is None:
             raise FileFormatError(
-                f"{path.name}: what are the columns?", "give --columns FILE (docs/how-to/import.md), or answer at a terminal"
+                f"{path.name}: what are the columns?", "give --columns FILE (docs/reference/instrument-files.md), or answer at a terminal"
             )
         return read_table(path.name, read_bytes(path), columns)
     reader = READERS.get(path.suffix.lower())

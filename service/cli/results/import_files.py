@@ -63,7 +63,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
 
     Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
     about their columns; the answers are kept as FILE.columns.toml. Lists of an artefact's points, one file for each pose,
-    need no questions (docs/how-to/artefact.md). What files do not say is asked, or stays unknown and widens U.
+    need no questions (docs/reference/instrument-files.md). What files do not say is asked, or stays unknown and widens U.
     Temperatures of the options count for files that state none. -m FILE: the machine with its chain and strokes, and its
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """

@@ -1,7 +1,8 @@
 """Campaigns of artefacts on machines of the families, laid out like the practice set of plates: public/, points/, sealed/.
 
 Nine kinds: a plate of holes, a plate of balls, a bar of balls, a step bar, each without and with one calibrated length, and two parts that
-the machine drilled and milled and a CMM measured. The readings follow docs/how-to/artefact.md alone; nothing of the product is imported.
+the machine drilled and milled and a CMM measured. The readings follow docs/reference/instrument-files.md alone; nothing of the product is
+imported.
 """
 
 import json
