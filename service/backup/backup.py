@@ -1,6 +1,6 @@
 """`abbe backup`: copy the database, samples not yet in it, and the audit's files, as they are at one instant, while the service runs.
 
-A backup is a folder with these files and a list of them.
+A backup is a folder with these files and a list of them. A shared backup holds the database in pieces (`abbe.service.backup.pieces`).
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import os
 import secrets
 import shutil
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass, fields
 from datetime import datetime
 from importlib.metadata import version
 from pathlib import Path
 
 from abbe.service.audit.book import AuditBook, faults, heads_in, this_account
+from abbe.service.backup.pieces import PIECES, ListedPieces, check, cut
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import document, record
@@ -27,7 +29,8 @@ from abbe.service.storage.copying import copy_online, prove_copy, rows_of, sync_
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.store import Store
 
-FORMAT = "abbe-backup/1"
+FORMAT, SHARED_FORMAT = "abbe-backup/1", "abbe-backup/2"
+"""With the database as one file, and in pieces."""
 LIST = "backup.json"
 DATABASE = "abbe.sqlite3"
 CAPTURE = "capture"
@@ -37,6 +40,8 @@ MACHINE = "machine.toml"
 COUNTED = ("machines", "campaigns", "runs", "chunks", "solutions", "verifications", "proposals", "audit")
 _PIECE = 1 << 20
 LONGEST_LIST = 64 << 20
+ROOM_BYTES = 256 << 20
+"""Room that a copy beside the database leaves on its disk."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -61,7 +66,7 @@ class BackupList:
     """List of a backup's content (``backup.json``).
 
     ``schema``: schema revision of the database; ``rows``: row counts of its main tables; ``segments``: number of files with samples that
-    were not yet in the database; ``files``: by path.
+    were not yet in the database; ``files``: by path, without pieces; ``pieces``: the database, if it is not one file.
     """
 
     format: str
@@ -74,6 +79,17 @@ class BackupList:
     segments: int
     audit: ListedAudit
     files: dict[str, ListedFile]
+    pieces: ListedPieces | None = None
+
+    @property
+    def bytes(self) -> int:
+        """Size of the backup."""
+        return sum(one.bytes for one in self.files.values()) + (0 if self.pieces is None else self.pieces.bytes)
+
+    @property
+    def new_bytes(self) -> int:
+        """How much of it no earlier backup holds."""
+        return self.bytes - (0 if self.pieces is None else self.pieces.bytes - self.pieces.new_bytes)
 
 
 @dataclass(frozen=True, slots=True)
@@ -82,11 +98,6 @@ class Backup:
 
     folder: Path
     listed: BackupList
-
-    @property
-    def database(self) -> Path:
-        """The copied database."""
-        return self.folder / DATABASE
 
     @property
     def segments(self) -> list[Path]:
@@ -104,9 +115,11 @@ def digest_of(path: Path) -> str:
 
 
 def file_list(folder: Path) -> dict[str, ListedFile | None]:
-    """Every file below a folder except the list, by relative path; None: no plain file. Raises OSError."""
+    """Every file below a folder except the list and the pieces, by relative path; None: no plain file. Raises OSError."""
     found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
+        if path.parent == folder / PIECES:
+            continue
         if not is_plain(path):  # a link, pipe or device: no backup has one, and a copy would follow it
             found[path.relative_to(folder).as_posix()] = None
         elif path.is_file() and path != folder / LIST:
@@ -124,11 +137,14 @@ def read_backup(folder: Path) -> Backup:
     """
     try:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
-        if doc.get("format") != FORMAT:
-            raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", f"this version of Abbe reads {FORMAT}")
+        if doc.get("format") not in {FORMAT, SHARED_FORMAT}:
+            known = f"this version of Abbe reads {FORMAT} and {SHARED_FORMAT}"
+            raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", known)
         listed = record(BackupList, doc, f"{folder / LIST}")
         wanted, found = listed.files, file_list(folder)
         wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
+        if not wrong and (listed.pieces is not None or (folder / PIECES).exists()):
+            check(folder / PIECES, [] if listed.pieces is None else listed.pieces.names)
     except FileNotFoundError:
         raise BackupRefused(f"{folder} is not a backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
     except OSError as err:
@@ -200,7 +216,9 @@ def sqlite_file(url: str, what: str) -> Path:
     return Path(str(parsed.database))
 
 
-def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True) -> BackupList:
+def back_up(
+    source: BackupSource, target: Path, utcnow: Callable[[], datetime], *, with_key: bool = True, share: bool = False
+) -> BackupList:
     """Make a backup: the new folder ``target`` (0700, files 0600), complete or not at all. The service keeps running.
 
     The backup holds everything that was on the disk at the call. Segments are copied first, because their samples leave them only when the
@@ -210,6 +228,9 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     ----------
     with_key : bool
         Include the audit's key. Without it, a holder of the backup cannot forge an audit, and `restore` asks for the key.
+    share : bool
+        Write the database in pieces, and link those that the latest such backup beside ``target`` has. The database is first copied beside
+        itself, so that ``target``'s disk gets only what is new.
 
     Returns
     -------
@@ -226,9 +247,11 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
     database = sqlite_file(source.url, "backup")
     if not database.is_file():
         raise BackupRefused(f"there is no database {database}", "give -m FILE or --db URL")
+    beside = _room_beside(database) if share else None
     part = _new_folder(target)
+    copy = beside or part / DATABASE
     try:
-        made = _fill(part, database, source, utcnow, with_key=with_key)
+        made = _fill(part, database, copy, source, utcnow, with_key=with_key)
         os.rename(part, target)
         sync_file(target.parent)
     except OSError as err:
@@ -237,6 +260,7 @@ def back_up(source: BackupSource, target: Path, utcnow: Callable[[], datetime], 
         ) from err
     finally:
         shutil.rmtree(part, ignore_errors=True)
+        copy.unlink(missing_ok=True)
     with Store.open(source.url) as store:
         options = {"made_utc": made.made_utc, "key": "with" if with_key else "without"}
         AuditBook(store, source.url).write(
@@ -256,31 +280,58 @@ def _new_folder(target: Path) -> Path:
     return part
 
 
-def _fill(part: Path, database: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> BackupList:
+def _room_beside(database: Path) -> Path:
+    """Return a new name beside a database, where a copy of it has room."""
+    needed, free = database.stat().st_size + ROOM_BYTES, shutil.disk_usage(database.parent).free
+    if free < needed:
+        raise BackupRefused(
+            f"a shared backup needs {needed / 1e6:.0f} MB beside {database}, and {free / 1e6:.0f} MB are free",
+            "free disk space, or leave out --share",
+        )
+    return database.with_name(f".{database.name}.copy-{secrets.token_hex(4)}")
+
+
+def _fill(part: Path, database: Path, copy: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> BackupList:
+    """Fill the folder of a backup; ``copy``: of the database, in this folder or, to be cut into pieces, outside."""
     made = utcnow().isoformat(timespec="seconds")
     segments = _segments(part / CAPTURE, source)
-    copy_online(database, part / DATABASE)
-    revision = prove_copy(part / DATABASE)
-    audit = _audit(part, source, with_key=with_key)
+    copy_online(database, copy)
+    revision = prove_copy(copy)
+    identity = str(rows_of(copy, "SELECT uid FROM identity")[0][0]) if revision >= "0004" else ""
+    audit = _audit(part, copy, source, with_key=with_key)
     if source.machine_file is not None:
         _copy_private(source.machine_file, part / MACHINE)
+    whole = copy == part / DATABASE
+    pieces = None if whole else cut(copy, part / PIECES, _latest_shared(part.parent, identity))
     listed = BackupList(
-        format=FORMAT,
+        format=FORMAT if whole else SHARED_FORMAT,
         made_utc=made,
         abbe=version("abbe"),
         source=mask_secrets(source.url),
-        database_id=str(rows_of(part / DATABASE, "SELECT uid FROM identity")[0][0]) if revision >= "0004" else "",
+        database_id=identity,
         schema=revision,
-        rows=counts(part / DATABASE),
+        rows=counts(copy),
         segments=segments,
         audit=audit,
         files={name: one for name, one in file_list(part).items() if one is not None},
+        pieces=pieces,
     )
     (part / LIST).touch(mode=0o600)
-    (part / LIST).write_text(json.dumps(document(listed), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
+    (part / LIST).write_text(json.dumps(document(listed, stated_only=True), indent=1, ensure_ascii=False) + "\n", encoding="utf-8")
     for path in [*part.rglob("*"), part]:
         sync_file(path)
     return listed
+
+
+def _latest_shared(folder: Path, identity: str) -> Path | None:
+    """Return the pieces of the latest shared backup of this database in a folder, if any."""
+    found = list[tuple[str, Path]]()
+    for path in folder.glob(f"[!.]*/{LIST}"):
+        with suppress(OSError, ValueError, AttributeError):
+            doc = json.loads(read_plain(path, LONGEST_LIST))
+            if doc.get("format") == SHARED_FORMAT and doc.get("database_id") == identity:
+                found.append((str(doc.get("made_utc")), path.parent / PIECES))
+    return max(found, default=("", None))[1]
 
 
 def _segments(folder: Path, source: BackupSource) -> int:
@@ -303,18 +354,18 @@ def _segments(folder: Path, source: BackupSource) -> int:
     return copied
 
 
-def _audit(part: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
+def _audit(part: Path, copy: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
     """Copy the audit's files: heads (a sealed digest per record) after the database, so that none is missing, but none of later records."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():
-        return ListedAudit(audit_faults(part / DATABASE, part / HEADS, None)[0], key=False, faults=[])
-    last = int(rows_of(part / DATABASE, "SELECT coalesce(max(id), 0) FROM audit")[0][0])
+        return ListedAudit(audit_faults(copy, part / HEADS, None)[0], key=False, faults=[])
+    last = int(rows_of(copy, "SELECT coalesce(max(id), 0) FROM audit")[0][0])
     lines = book.head_file.read_text(encoding="ascii", errors="replace").splitlines(keepends=True) if book.head_file.exists() else []
     kept = [line for line in lines if not (number := line.partition(" ")[0]).isdigit() or int(number) <= last]
     (part / HEADS).touch(mode=0o600)
     (part / HEADS).write_text("".join(kept), encoding="ascii", errors="replace")
-    records, found = audit_faults(part / DATABASE, part / HEADS, book.key_file)
+    records, found = audit_faults(copy, part / HEADS, book.key_file)
     if with_key:
         _copy_private(book.key_file, part / KEY)
     return ListedAudit(records, with_key, found)

@@ -12,6 +12,7 @@ from pathlib import Path
 
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_account
 from abbe.service.backup.backup import CAPTURE, DATABASE, HEADS, KEY, Backup, BackupSource, audit_faults, read_backup, sqlite_file
+from abbe.service.backup.pieces import PIECES, join
 from abbe.service.capture.settings import segment_folder
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import BackupRefused
@@ -77,7 +78,9 @@ def restore(
     part = database.parent / f".{database.name}.restoring-{secrets.token_hex(4)}"
     try:
         part.mkdir(mode=0o700)
-        shutil.copytree(backup.folder, part, dirs_exist_ok=True)
+        shutil.copytree(backup.folder, part, dirs_exist_ok=True, ignore=shutil.ignore_patterns(PIECES))
+        if backup.listed.pieces is not None:
+            join(backup.folder / PIECES, backup.listed.pieces.names, part / DATABASE)
         if key_file is not None:
             shutil.copyfile(key_file, part / KEY)
         records = _prove(part, folder)

@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 def backup(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="New folder.", show_default=False)],
     without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
+    share: Annotated[
+        bool, typer.Option("--share", help="Write only what the latest such backup in the same folder lacks; each stays complete.")
+    ] = False,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
@@ -26,14 +29,14 @@ def backup(
     from abbe.service.clock import SystemClock
     from abbe.service.domain.document import document
 
-    made = back_up(_source(db, machine), target, SystemClock().utc, with_key=not without_key)
+    made = back_up(_source(db, machine), target, SystemClock().utc, with_key=not without_key, share=share)
     if as_json:
         print_json(document(made))
     else:
-        rows, size = made.rows, sum(one.bytes for one in made.files.values())
-        typer.echo(
-            f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {made.segments} files of samples, {size / 1e6:.1f} MB, checked"
-        )
+        rows, size = made.rows, f"{made.bytes / 1e6:.1f} MB"
+        if made.pieces is not None:
+            size += f" ({made.new_bytes / 1e6:.1f} MB new)"
+        typer.echo(f"{target}: {rows['runs']} runs, {rows['verifications']} checks, {made.segments} files of samples, {size}, checked")
         for text in made.audit.faults[:3]:
             typer.echo(f"audit: {text}")
         if made.audit.records and not made.audit.key:
