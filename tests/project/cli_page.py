@@ -27,7 +27,7 @@ The codes of faults are listed in [error-codes.md](error-codes.md).
 
 `-m FILE` (`--machine FILE`) names the machine file; without it, it is the one that `ABBE_MACHINE` names, else `abbe.toml` in the current
 folder. A command works with the database of the machine file. `--db URL` names a database directly; without a machine it is the one that
-`ABBE_DB` names, else `abbe.sqlite3` in the current folder.
+`ABBE_DB` names, else `abbe.sqlite3` in the current folder. Reports are in the language that `ABBE_LANGUAGE` names (`en`, `de`, `ja`, `ko`).
 
 The answer goes to standard output, as JSON with `--json`, and into a file with `--out FILE`; progress and the next command go to standard
 error. A table is folded at a terminal's width; into a pipe it has tabs between its cells. The tables below leave out `-m`, `--db`, `--json`

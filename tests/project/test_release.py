@@ -41,14 +41,17 @@ def test_licence_and_notice_are_the_whole_texts() -> None:
     assert supported == {"3.11", "3.12", "3.13", "3.14"}
 
 
-def test_the_wheel_carries_two_packages_of_others_with_their_licences() -> None:
-    """NOTICE says so: no fonts, and nothing that somebody else wrote but uPlot and nodesets of OPC UA, where they were fetched."""
+def test_the_wheel_carries_four_packages_of_others_with_their_licences() -> None:
+    """NOTICE says so: nothing that somebody else wrote but uPlot, nodesets of OPC UA and two fonts, where they were fetched."""
     foreign = re.compile(r"\.(ttf|otf|woff2?|min\.js|min\.css|xml)$")
     parts = [ROOT / part for part in ("service", "drivers", "models", "simulators")]
     found = {path for part in parts for path in part.rglob("*") if foreign.search(path.name)}
-    folders = ("service/web/static/uplot", "service/plant/opcua/nodesets")
+    fonts = ("service/rendering/fonts/japanese", "service/rendering/fonts/korean")
+    folders = ("service/web/static/uplot", "service/plant/opcua/nodesets", *fonts)
     assert {path.parent for path in found} <= {ROOT / folder for folder in folders}
     assert all("Copyright" in (path.parent / "LICENSE").read_text(encoding="utf-8") for path in found)
+    licences = [path / "LICENSE_FONT" for font in fonts if (path := ROOT / font).exists()]
+    assert all("OPEN FONT LICENSE" in path.read_text(encoding="utf-8") for path in licences)
     for folder in folders:
         assert subprocess.run(["git", "check-ignore", "-q", f"{folder}/version"], cwd=ROOT, check=False).returncode in {0, 128}
 

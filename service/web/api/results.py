@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from dataclasses import replace
 from datetime import UTC, datetime
 from enum import StrEnum
 from typing import Annotated, Any, Literal
@@ -21,6 +22,7 @@ from abbe.service.rendering.document_page import FORMS, default_name
 from abbe.service.report.report import certified, numbered_report, stored_report
 from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
+from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.schemas import CheckList, DiscoveryList, SolutionList
 
@@ -138,7 +140,7 @@ class ReportForm(StrEnum):
 MEDIA = {ReportForm.PDF: "application/pdf", ReportForm.HTML: "text/html", ReportForm.CSV: "text/csv", ReportForm.JSON: "application/json"}
 WRITTEN: dict[int | str, dict[str, Any]] = {
     200: {
-        "description": "The report, as a file to be saved; the same data give the same bytes",
+        "description": "The report, as a file to be saved; the same data and language give the same bytes",
         "content": {
             "application/pdf": {"schema": {"type": "string", "format": "binary"}},
             "text/html": {"schema": {"type": "string"}},
@@ -161,16 +163,19 @@ def add_reports(app: FastAPI, sources: Sources) -> None:
         form: Annotated[ReportForm, Query(description="File format.")] = ReportForm.PDF,
         machine: Annotated[str | None, Query(description="Machine of the push, if the store has several.")] = None,
     ) -> Response:
-        """A report to sign: figures with U by ISO 230, conditions, decision, unobservable quantities."""
+        """A report to sign: figures with U by ISO 230, conditions, decision, unobservable quantities.
+
+        PDF and HTML are in the reader's language.
+        """
         async with few:
-            name, data = await asyncio.to_thread(_written, sources, kind, number, form, machine)
+            name, data = await asyncio.to_thread(_written, sources, kind, number, form, machine, current().lang)
         return Response(data, media_type=MEDIA[form], headers={"Content-Disposition": f'attachment; filename="{name}"'})
 
 
-def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, machine: str | None) -> tuple[str, bytes]:
+def _written(sources: Sources, kind: ReportKind, number: int, form: ReportForm, machine: str | None, lang: str) -> tuple[str, bytes]:
     with as_stored():
         document = certified(_document(sources, kind, number, machine), sources.rules, None, sources.reader.clock.utc().date())
-        found = FORMS[f".{form}"](document)
+        found = FORMS[f".{form}"](replace(document, lang=lang))
     name = default_name(document).removesuffix(".pdf") + f".{form}"
     return name, found.encode() if isinstance(found, str) else found
 

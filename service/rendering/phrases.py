@@ -1,0 +1,105 @@
+"""English sentences (stored verdicts and remarks, reports, pictures) in the reader's language.
+
+A file of the folder ``phrases`` maps English patterns to the same in each language: ``"{n} runs"`` fits "17 runs", and the same rules
+translate what stands in the braces. A place holds no end of a sentence, and one with a name of one letter no blanks. A phrase has no full
+stop at its end. What no pattern knows is tried sentence by sentence and part by part, and stays English otherwise, so that nothing is lost;
+tests walk all screens and reports and find what has none.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from functools import cache, lru_cache
+from html import escape, unescape
+from pathlib import Path
+
+from markupsafe import Markup
+
+FOLDER = Path(__file__).parent / "phrases"
+ENGLISH = "en"
+LANGUAGES = (ENGLISH, "de", "ja", "ko")
+LONGEST = 2000
+"""Longer texts are no sentences."""
+_PLACE = re.compile(r"\{(\w+)\}")
+_SHOWN = re.compile(r'>([^<>]+)<|aria-label="([^"]*)"')
+_WORD = re.compile("[A-Za-z]{2}|/")
+_ENDS = (". ", "; ", ": ", ", ")
+_OWN_ENDS = {"ja": {". ": "。", ", ": "、", ".": "。"}}
+"""How a language writes ends of sentences and parts; others write them as English does."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Pattern:
+    """A phrase with places: its text before the first and after the last, both as one expression, and the phrase in the language."""
+
+    head: str
+    tail: str
+    fits: re.Pattern[str]
+    told: str
+
+
+@cache
+def _phrases(lang: str) -> tuple[dict[str, str], tuple[_Pattern, ...]]:
+    """Phrases without places, and patterns of those with some, the most literal first."""
+    known: dict[str, str] = {}
+    for file in sorted(FOLDER.glob("*.json")):
+        known |= {key: told[lang] for key, told in json.loads(file.read_text(encoding="utf-8")).items() if lang in told}
+    placed = sorted((key for key in known if _PLACE.search(key)), key=lambda key: -len(_PLACE.sub("", key)))
+    return {k: v for k, v in known.items() if not _PLACE.search(k)}, tuple(_pattern(key, known[key]) for key in placed)
+
+
+def _pattern(key: str, told: str) -> _Pattern:
+    parts = _PLACE.split(key)
+    places = {part: r"\S+?" if len(part) == 1 else r"(?:(?!\. ).)+?" for part in parts[1::2]}
+    text = "".join(re.escape(part) if k % 2 == 0 else f"(?P<{part}>{places[part]})" for k, part in enumerate(parts))
+    return _Pattern(parts[0], parts[-1], re.compile(text, re.DOTALL), told)
+
+
+@lru_cache(16384)
+def phrase(lang: str, text: str) -> str:
+    """The text in a language, as far as its phrases know it."""
+    if lang == ENGLISH or len(text) > LONGEST or not _WORD.search(text):
+        return text
+    bare, ends = text.removesuffix("."), _OWN_ENDS.get(lang, {})
+    said = _fitting(lang, bare) or _of_other_case(lang, bare)
+    if said is not None:
+        return said if bare == text else said + ends.get(".", ".")
+    for end in _ENDS:
+        parts = text.split(end)
+        told = [phrase(lang, part) for part in parts] if len(parts) > 1 else parts
+        if told != parts:
+            return ends.get(end, end).join(told)
+    return text
+
+
+def _fitting(lang: str, text: str) -> str | None:
+    exact, patterns = _phrases(lang)
+    if text in exact:
+        return exact[text]
+    for one in patterns:
+        if text.startswith(one.head) and text.endswith(one.tail):
+            found = one.fits.fullmatch(text)
+            if found is not None:
+                return one.told.format(**{name: phrase(lang, value) for name, value in found.groupdict().items()})
+    return None
+
+
+def _of_other_case(lang: str, text: str) -> str | None:
+    """A phrase whose first letter is large where the text's is small, or the reverse."""
+    said = _fitting(lang, text[:1].swapcase() + text[1:])
+    return said if said is None or text[:1].islower() else said[:1].upper() + said[1:]
+
+
+def pictured(lang: str, svg: str) -> Markup:
+    """A picture of our own writer with its texts in a language."""
+    if lang == ENGLISH:
+        return Markup(svg)  # noqa: S704 - the writer has escaped every text
+
+    def say(found: re.Match[str]) -> str:
+        if found[1] is not None:
+            return f">{escape(phrase(lang, unescape(found[1])), quote=False)}<"
+        return f'aria-label="{escape(phrase(lang, unescape(found[2])))}"'
+
+    return Markup(_SHOWN.sub(say, svg))  # noqa: S704 - escaped again above

@@ -1,0 +1,109 @@
+"""Reports are in their language: every text of every kind of report, its PDF, and what happens without a font or a known language."""
+
+from __future__ import annotations
+
+import io
+import re
+from collections.abc import Iterator
+from dataclasses import replace
+from html import unescape
+from pathlib import Path
+from typing import Any
+
+import pypdf
+import pytest
+
+from abbe.service.errors import FileFormatError
+from abbe.service.rendering import document_page
+from abbe.service.rendering.document import Document
+from abbe.service.rendering.document_data import document_json, shown
+from abbe.service.rendering.document_page import document_html, document_pdf, write_document
+from abbe.service.rendering.phrases import LANGUAGES
+from tests.conftest import Require
+from tests.languages import english
+from tests.pages_world import filled_once
+from tests.report_world import documents
+
+OTHERS = LANGUAGES[1:]
+LETTERS = {"de": "[äöüß]", "ja": "[\u3040-\u30ff\u4e00-\u9fff]", "ko": "[\uac00-\ud7ff]"}
+
+
+@pytest.fixture(scope="module")
+def reports(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Document]:
+    return documents(filled_once(tmp_path_factory), tmp_path_factory)
+
+
+def texts(value: Any) -> Iterator[str]:
+    """What a person reads or hears of the data of a page."""
+    if isinstance(value, dict):
+        for key, one in value.items():
+            yield from texts(one) if key not in {"kind", "sign", "layout", "lang", "format"} else ()
+    elif isinstance(value, list):
+        for one in value:
+            yield from texts(one)
+    elif isinstance(value, str) and value.startswith("<svg"):
+        yield from (unescape(text) for text in re.findall(r">([^<>]+)<", value))
+    elif isinstance(value, str):
+        yield value
+
+
+@pytest.mark.parametrize("lang", OTHERS)
+def test_every_text_of_every_report_is_in_its_language(lang: str, reports: dict[str, Document]) -> None:
+    left: dict[str, str] = {}
+    for name, document in reports.items():
+        originals = frozenset(texts(shown(document)))
+        left |= {text: name for text in texts(shown(replace(document, lang=lang))) if english(lang, text, originals)}
+    assert "\n".join(f"{text}  {where}" for text, where in sorted(left.items())) == ""
+
+
+@pytest.mark.parametrize("lang", OTHERS)
+def test_a_pdf_says_what_its_data_say_and_has_letters_for_it(lang: str, reports: dict[str, Document], require: Require) -> None:
+    """Words of the templates are in the data, too: a PDF with another word has one that nobody could translate."""
+    found = lang not in document_page.FONTS_OF or bool(document_page.font_folders(lang))
+    require("fonts", found, "neither fonts-noto-cjk nor those of deploy/npm_files.py are here")
+    for name, document in reports.items():
+        own = replace(document, lang=lang)
+        reader = pypdf.PdfReader(io.BytesIO(document_pdf(own)))
+        text = " ".join(page.extract_text() for page in reader.pages)
+        assert re.search(LETTERS[lang], text), name
+        assert words(text) - words(" ".join(texts(shown(own)))) == set(), name
+        assert reader.trailer["/Root"]["/Lang"] == lang
+
+
+def squeezed(made: bytes) -> str:
+    return "".join("".join(page.extract_text() for page in pypdf.PdfReader(io.BytesIO(made)).pages).split())
+
+
+def test_without_a_font_a_report_is_english_and_says_so(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """German needs no font of the computer; the digest and so the number of a certificate do not depend on what is said."""
+    monkeypatch.setattr(document_page, "FONTS", (str(tmp_path),))
+    monkeypatch.delenv("ABBE_FONTS", raising=False)
+    plain = Document(kind="run", title="Run a/b", verdict=("ok", "Passed", ""))
+    for lang in ("ja", "ko"):
+        text = squeezed(document_pdf(replace(plain, lang=lang)))
+        assert "".join(document_page.IN_ENGLISH.format(lang=lang).split()) in text
+        assert "Passed" in text
+    assert "Bestanden" in squeezed(document_pdf(replace(plain, lang="de")))
+    assert document_json(plain) == document_json(replace(plain, lang="ja"))
+    assert "合格" in document_html(replace(plain, lang="ja")), "a browser has its own fonts"
+
+
+def test_the_command_line_takes_the_language_of_its_environment(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    plain, target = Document(kind="run", title="Run a/b", verdict=("ok", "Passed", "")), tmp_path / "a.html"
+    for lang, word in {"": "Passed", "en": "Passed", "de": "Bestanden", "ko": "합격"}.items():
+        monkeypatch.setenv("ABBE_LANGUAGE", lang)
+        write_document(plain, target)
+        assert word in target.read_text(encoding="utf-8")
+    monkeypatch.setenv("ABBE_LANGUAGE", "fr")
+    with pytest.raises(FileFormatError, match="no language 'fr'"):
+        write_document(plain, target)
+
+
+def test_names_stay_names() -> None:
+    """A machine called Table and a customer called Limit are no words to be told."""
+    plain = Document(kind="run", title="t", about={"Machine": "Table", "Campaign": "Limit", "Feed": "10 to 20 mm/min"}, lang="de")
+    assert [one["value"] for one in shown(plain)["about"]] == ["Table", "Limit", "10 bis 20 mm/min"]
+
+
+def words(text: str) -> set[str]:
+    return set(re.findall("[A-Za-zäöüßÄÖÜ]{3,}", text))
