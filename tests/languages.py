@@ -22,7 +22,7 @@ NAMES |= words("Werk Nord Ringstr Bonn Meier Muster GmbH Talweg dppp dnpp dpnp d
 """Of machine, campaigns, runs, schedules, recipes, people, devices, zones and programs of the worlds."""
 REMARKS = ("the colour of the machine", "worse on the gauge block", "look at it")
 """What people of the world wrote."""
-SHORT = words("Abbe RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min English Deutsch µrad µin")
+SHORT = words("Abbe PIN RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min English Deutsch µrad µin")
 CODES = (
     r"CAL-[-0-9a-f]+",
     r"[0-9a-f]{16,}",

@@ -11,6 +11,7 @@ from pydantic import AfterValidator
 
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.queries.people import users as listed_users
+from abbe.service.rendering.phrases import phrase
 from abbe.service.users.roles import Permission, Role
 from abbe.service.web.bodies import form_of
 from abbe.service.web.frame import current
@@ -18,7 +19,6 @@ from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.login import signature_refusal
 from abbe.service.web.pages.context import PageContext, can_be_stored
-from abbe.service.web.phrases import phrase
 from abbe.service.web.problems import problem
 
 LONGEST_FORM = 4096
