@@ -43,4 +43,4 @@ def test_a_mistake_that_nobody_notices_is_said_and_the_copy_is_put_right() -> No
             assert "_LATE_WINDOW = 129" in path.read_text(encoding="utf-8")
             assert stale(harmless, copy)
         assert path.read_text(encoding="utf-8") == before
-    assert "| harmless | SURVIVED in `drivers/ballbar/stream.py`: `` |" in page([(harmless, "SURVIVED", "")])
+    assert "- **SURVIVED** in `drivers/ballbar/stream.py`: harmless" in page([(harmless, "SURVIVED", "")])

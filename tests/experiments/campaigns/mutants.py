@@ -27,16 +27,14 @@ COPIED = ("abbe", "service", "drivers", "models", "simulators", "tests", "pyproj
 TEST_S, RUN_S = 400, 3600
 HEAD = """# Mistakes that the tests have to notice
 
-Each mistake is put into a copy of the source (`tests/experiments/campaigns/source_mutants.py` says where); the named test has to fail
-with it, and passes without it. CI runs the rows marked *, all at once. The push protocol has mutants of its own
+Each mistake is put into a copy of the source. A test of the file named here has to fail with it, and passes without it; which test and which
+line, says `tests/experiments/campaigns/source_mutants.py`. CI runs those marked *, all at once. The push protocol has mutants of its own
 ([develop](../how-to/develop.md)).
 
     python -m tests.experiments.campaigns.mutants --page docs/explanation/mutants.md      # half an hour, two cores; writes this page
 
 {date}: {killed} of {all} killed.
 
-| mistake | noticed by |
-|---|---|
 """
 
 
@@ -120,16 +118,15 @@ def outcome(copy: Path, mutant: Mutant, good: dict[tuple[str, ...], Found]) -> t
     return found.word, found.failed[0] if found.failed else ""
 
 
-def _noticed(mutant: Mutant, word: str, by: str) -> str:
-    test = f"`{by.split('[')[0]}`"
-    return test if word == "killed" else f"{word} in `{mutant.path}`: {test}"
-
-
 def page(rows: list[tuple[Mutant, str, str]]) -> str:
-    """The table for docs/explanation/mutants.md."""
+    """The list for docs/explanation/mutants.md, by the file of the test that noticed a mistake."""
+    noticed_in: dict[str, list[str]] = {}
+    for mutant, word, by in rows:
+        where = f"`{by.partition('::')[0]}`" if word == "killed" else f"**{word}** in `{mutant.path}`"
+        noticed_in.setdefault(where, []).append(mutant.name + (" *" if mutant.fast else ""))
     killed = sum(word == "killed" for _, word, _ in rows)
-    lines = [f"| {m.name}{' *' if m.fast else ''} | {_noticed(m, word, by)} |" for m, word, by in rows]
-    return HEAD.format(date=datetime.now(UTC).date(), killed=killed, all=len(rows)) + "\n".join(lines) + "\n"
+    head = HEAD.format(date=datetime.now(UTC).date(), killed=killed, all=len(rows))
+    return head + "".join(f"- {where}: {'; '.join(names)}\n" for where, names in sorted(noticed_in.items()))
 
 
 def main() -> int:
