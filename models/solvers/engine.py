@@ -96,7 +96,7 @@ def _fourth(run: RunData, y: F1) -> F1:
 
 
 ROUNDS = 8
-SETTLED = 0.01
+SETTLED = 0.02
 """The iteration ends when no predicted reading moves, and no weight changes, by more than this (readings in units of their noise)."""
 HUBER = 1.5
 GENTLE = 3
