@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import platform
 from collections.abc import Awaitable, Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from dataclasses import asdict, dataclass, field, replace
 from importlib.metadata import version
 from typing import Any
@@ -26,6 +26,7 @@ from abbe.service.campaigns.campaign_run import (
 )
 from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.capture.live import LiveFeed
+from abbe.service.capture.machine_reading import LatestReading
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session, notes_since
@@ -51,7 +52,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 
 @dataclass
 class ProgressReporter:
-    """Progress of a job in planned machine seconds; the wall time per machine second so far gives the ETA.
+    """Progress of a job in planned machine seconds; the dry run, then the wall time per machine second so far, gives the ETA.
 
     Time spent waiting for a person (``waited_s``) does not count.
     """
@@ -106,9 +107,10 @@ class ProgressReporter:
         self.done_s += duration_s
         self.skipped_s += duration_s
 
-    def _eta_s(self, done_s: float) -> float | None:
+    def _eta_s(self, done_s: float) -> float:
         elapsed, made_s = self.clock.monotonic_s() - self.start_s - self.waited_s, done_s - self.skipped_s
-        return elapsed / made_s * (self.total_s - done_s) if made_s > 0.02 * self.total_s else None
+        # Before much is done, the times of the dry run are all there is.
+        return (elapsed / made_s if made_s > 0.02 * self.total_s else 1.0) * (self.total_s - done_s)
 
     def _report(self, eta_s: float | None) -> None:
         now = self.control.progress if self.control is not None else Progress()
@@ -227,11 +229,14 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     campaign_run = await _campaign_run(session, store, site, plan, journal, options, control)
     reporter = ProgressReporter(plan.name, sum(d.duration_s for d in dry), progress, clock, control=control)
     control.now(State.RUNNING)
+    reporter.at(0.0, "")
     notes, reporting = IncidentNotes(journal, clock), asyncio.create_task(reporter.report_states())
     once = _once(session, store, site, under_way, reporter, options.live)
     try:
+        shown = nullcontext() if options.live is None else options.live.showing(LatestReading(session, clock))
         async with incidents_noted(session, notes):
-            run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, reporter, resumed, once)
+            with shown:
+                run_ids = await _all_tests(plan, [d.duration_s for d in dry], campaign_run, reporter, resumed, once)
     except BaseException as error:
         await _ended(journal, notes, "stopped" if isinstance(error, Stopped) else "failed", error)
         raise

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import asyncio
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -17,7 +18,7 @@ from numpy.typing import NDArray
 
 from abbe.drivers.api import BarBatch, Point, bar_is_valid, on_path
 from abbe.service.domain.bounds import WORD
-from abbe.service.domain.progress import RecordedPath
+from abbe.service.domain.progress import MachineReading, RecordedPath
 from abbe.service.domain.run import BarSetup
 from abbe.service.runs.coverage import about_axis, helix_axis
 
@@ -52,7 +53,9 @@ class LiveFeed:
     def __init__(self) -> None:
         self.path: RecordedPath | None = None
         self.active = asyncio.Event()
-        """Set during the recording of a path."""
+        """Set while there is something to show: a path, or a machine that is being measured."""
+        self.machine: Callable[[], MachineReading | None] | None = None
+        """Tells the present state of the machine during a measurement."""
         self._number = 0
         self._first_seq: int | None = None
         self._batches: deque[BarBatch] = deque(maxlen=MOST_BATCHES)
@@ -76,12 +79,29 @@ class LiveFeed:
             duration_s=duration_s,
             angle_deg=angle_deg,
         )
-        self.active.set()
+        self._show()
 
     def end(self) -> None:
         """End the path."""
         self.path = None
-        self.active.clear()
+        self._show()
+
+    @contextmanager
+    def showing(self, machine: Callable[[], MachineReading | None]) -> Iterator[None]:
+        """Show the state of the machine during this block."""
+        self.machine = machine
+        self._show()
+        try:
+            yield
+        finally:
+            self.machine = None
+            self._show()
+
+    def _show(self) -> None:
+        if self.path is None and self.machine is None:
+            self.active.clear()
+        else:
+            self.active.set()
 
     def take(self, batch: BarBatch) -> None:
         """Receive a batch in the driver's thread. Never waits, never raises."""

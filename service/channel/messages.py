@@ -3,7 +3,8 @@
 Messages are frozen, validated at both ends, and bounded in length. They travel as four bytes of length, then JSON, over a socket pair that
 the parent created; it has no file, port or name to which another process could connect.
 
-The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`, `Answer`); the web process forwards what a person
+The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`,
+`LiveMachine`, `Answer`); the web process forwards what a person
 requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
 table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it.
 """
@@ -22,7 +23,7 @@ from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import MachineObject, Rules
 from abbe.service.domain.machine_file import MachineFileSummary
-from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
 
@@ -128,6 +129,15 @@ class LiveSamples:
 
 
 @dataclass(frozen=True, slots=True)
+class LiveMachine:
+    """The machine during a measurement; None: nothing is measured any more."""
+
+    __pydantic_config__ = _STRICT
+    kind: Literal["machine"]
+    machine: MachineReading | None
+
+
+@dataclass(frozen=True, slots=True)
 class Answer:
     """Outcome of a request. ``job``: the job that the request started or steered."""
 
@@ -212,7 +222,7 @@ class PushNow(WebRequest):
     key: Word
 
 
-FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | Answer
+FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | LiveMachine | Answer
 CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow
 """Requests that the core answers with an `Answer`."""
 FromWeb = Serving | WebHeartbeat | CoreRequest

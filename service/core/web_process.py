@@ -24,6 +24,7 @@ from abbe.service.channel.messages import (
     ConfirmPrompt,
     CoreRequest,
     Jobs,
+    LiveMachine,
     LivePath,
     LiveSamples,
     PushNow,
@@ -45,32 +46,40 @@ from abbe.service.errors import AbbeError, ChannelBroken
 
 FRAME_S = 0.05
 """Time between two messages with samples, s: 20 messages a second, each with about 50 samples at 1 kHz."""
+FRAMES_EACH = 2
+"""The state of the machine is told with every second message."""
 NO_PATH = LivePath("path", RecordedPath())
 
 
 async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
     """Send every path and its samples, until cancelled. A web process that reads too slowly misses samples; the disk misses none."""
     live.stretches()  # discards samples that gathered while nobody listened
-    sent = 0
+    sent, told, frame = 0, False, 0
     while True:
         await live.active.wait()
-        while live.path is not None:
+        while live.active.is_set():
             if not wire.is_full:
                 sent = _send_path(wire, live, sent)
                 for part in live.stretches():
                     wire.send(_message(part, clock))
+                if live.machine is not None and frame % FRAMES_EACH == 0:
+                    wire.send(LiveMachine("machine", live.machine()))
+                    told = True
+            frame += 1
             await asyncio.sleep(FRAME_S)
-        if sent:
-            wire.send(NO_PATH)
-            sent = 0
+        sent = _send_path(wire, live, sent)
+        if told:
+            wire.send(LiveMachine("machine", None))
+            told = False
 
 
 def _send_path(wire: Wire, live: LiveFeed, sent: int) -> int:
+    """Tell the page of a new path, or that there is none any more; return the number of the path that it knows, 0: none."""
     path = live.path
-    if path is None or path.number == sent:
-        return sent
-    wire.send(LivePath("path", path))
-    return path.number
+    number = 0 if path is None else path.number
+    if number != sent:
+        wire.send(NO_PATH if path is None else LivePath("path", path))
+    return number
 
 
 def _message(part: Stretch, clock: Clock) -> LiveSamples:

@@ -23,7 +23,7 @@ from secrets import token_hex
 from typing import Any, TypeVar, cast
 
 from abbe.drivers import registry
-from abbe.drivers.api import BallBar, Controller, ControllerStatus, DisplacementMeter, Fixture
+from abbe.drivers.api import BallBar, Controller, ControllerStatus, DisplacementMeter, Fixture, LaserReading
 from abbe.drivers.errors import DriverError
 from abbe.service.domain.machine import DeviceUrls as DeviceUrls
 from abbe.service.domain.machine import address_of
@@ -204,6 +204,37 @@ def latest_status(controller: Controller) -> ControllerStatus | None:
     return controller.latest_status if isinstance(controller, _Noted) else None
 
 
+class _NotedMeter:
+    """A displacement meter that also notes its latest reading."""
+
+    def __init__(self, meter: DisplacementMeter) -> None:
+        self.noted_meter = meter
+        self.latest_reading: LaserReading | None = None
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self.noted_meter, name)
+
+    async def read(self, *, after_count: int | None = None) -> LaserReading:
+        """Wait for a sample, and note it."""
+        self.latest_reading = reading = await self.noted_meter.read(after_count=after_count)
+        return reading
+
+    async def peek(self) -> LaserReading:
+        """Return the present sample, and note it."""
+        self.latest_reading = reading = await self.noted_meter.peek()
+        return reading
+
+
+def noted_meter(meter: DisplacementMeter) -> DisplacementMeter:
+    """Wrap a displacement meter to note its latest reading."""
+    return cast(DisplacementMeter, _NotedMeter(meter))
+
+
+def latest_reading(meter: DisplacementMeter) -> LaserReading | None:
+    """Return the last reading of a meter of `noted_meter`; None before the first, or for other meters."""
+    return meter.latest_reading if isinstance(meter, _NotedMeter) else None
+
+
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:
     """Return pairs [controller us, host s] since a controller time: of more than 500, only the least delayed of each of 500 groups."""
     if not isinstance(controller, _Noted):
@@ -303,7 +334,7 @@ async def open_session(
         fixture = None if urls.fixture is None else await opened(registry.open_fixture(urls.fixture, ask))
         raise_all(troubles)
         assert controller is not None
-        yield Session(controller, ballbar, laser, fixture, ask is not no_console)
+        yield Session(controller, ballbar, None if laser is None else noted_meter(laser), fixture, ask is not no_console)
 
 
 def raise_all(troubles: Sequence[AbbeError | DriverError]) -> None:

@@ -78,6 +78,24 @@ class RecordedPath:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class MachineReading:
+    """The machine during a measurement, from answers that the measurement asked for. None: not known.
+
+    ``at_ms``: when the controller answered, UTC milliseconds; ``position_mm``: of the axes; ``feed_mm_min``: along the chord between two
+    positions; ``air_c``, ``laser_mm``: of the laser, whose count means something while ``beam_good``.
+    """
+
+    at_ms: float
+    position_mm: tuple[float, float, float]
+    feed_mm_min: float | None
+    override_percent: Number
+    door_open: bool
+    air_c: float | None
+    laser_mm: float | None
+    beam_good: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class DeviceStatus:
     """State of a device of the machine file, and the time of its last answer. The device is not polled between checks."""
 

@@ -56,6 +56,11 @@ def latest_checks(reader: Reader, limit: int) -> list[Verification]:
     return checks(reader, reader.machine, None, None, limit)[0]
 
 
+def last_good(found: Sequence[Verification], recipe: str) -> Verification | None:
+    """The first of some checks, newest first, of a recipe that passed and did not verify a push; None: there is none."""
+    return next((check for check in found if check.verdict == "pass" and check.recipe == recipe and not check.push), None)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _CheckRow:
     """The columns of a check."""

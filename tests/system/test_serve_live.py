@@ -9,6 +9,7 @@ from __future__ import annotations
 import importlib.util
 import json
 import os
+import re
 import signal
 import sqlite3
 import statistics
@@ -211,6 +212,48 @@ def test_a_browser_draws_a_running_check_and_stops_it(tmp_path: Path) -> None:
         page.wait_for_selector("#live-over:not([hidden])", timeout=30_000)
         assert "cannot tell" in page.inner_text("#live-outcome")
         assert states(one)[-1] in {"stopped", "aborted"}
+        assert seen.errors == []
+        assert only_us(seen)
+
+
+SEEN = """() => {
+  const stop = document.querySelector("#steer [data-how=stop]").getBoundingClientRect();
+  const bar = document.getElementById("steer").getBoundingClientRect();
+  const shown = ["strip", "polar"].map(id => document.getElementById(id)).filter(e => e.offsetParent).map(e => e.getBoundingClientRect());
+  return {stop: stop.bottom <= innerHeight && stop.height >= 44, hidden: shown.filter(r => r.top < 0 || r.bottom > bar.top + 1).length,
+    share: Math.max(...shown.map(r => r.height)) / innerHeight, wide: Math.max(...shown.map(r => r.right)) / innerWidth};
+}"""
+
+
+def test_trace_position_and_stop_are_seen_together_on_every_screen_and_then_the_laser(tmp_path: Path) -> None:
+    axe = axe_core()
+    with serving(tmp_path, 3.0) as one, browser() as seen:
+        page = seen.page
+        log_in(page, one.base)
+        start(page, one.base, 100)
+        until_drawn(page, 100)
+        for size, scheme in zip(("1280", "1024", "390"), ("light", "dark", "light"), strict=True):
+            page.emulate_media(color_scheme=scheme)  # type: ignore[arg-type]
+            page.set_viewport_size(SIZES[size])  # type: ignore[arg-type]
+            page.goto(f"{one.base}/live")
+            page.wait_for_selector("#dro:not([hidden])")
+            page.wait_for_function("() => Number(document.getElementById('live-samples').textContent) > 50")
+            where = page.evaluate(SEEN)
+            assert where["stop"], size
+            assert where["hidden"] == 0, (size, where)
+            assert where["share"] > (0.24 if size == "390" else 0.33), (size, where)
+            assert all(re.fullmatch(r"-?\d+\.\d{3}", page.inner_text(f"#dro-{axis}")) for axis in "xyz")
+            page.wait_for_function("() => Number(document.getElementById('dro-feed').textContent) > 100")
+            assert page.inner_text("#dro-door") == "shut"
+            assert re.search(r"\d+ (s|min) left", page.inner_text("#live-left")), "the dry run knows"
+            assert faults(page, axe, CONTRAST) == []
+            shot(page, f"serve-live-{size}-{scheme}.png")
+        page.wait_for_selector("#live-pair.single:not(.old)", timeout=90_000)
+        page.wait_for_function("() => document.getElementById('strip-scale').textContent.startsWith('60 s')")
+        assert page.inner_text("#live-run") == "Laser"
+        assert re.fullmatch(r"\d+\.\d °C", page.inner_text("#dro-air"))
+        assert page.evaluate(INKED, "strip") > 20
+        shot(page, "serve-live-laser-390.png")
         assert seen.errors == []
         assert only_us(seen)
 

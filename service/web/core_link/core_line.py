@@ -13,6 +13,7 @@ from abbe.service.channel.messages import (
     ConfirmPrompt,
     CoreRequest,
     Jobs,
+    LiveMachine,
     LivePath,
     LiveSamples,
     PushNow,
@@ -66,6 +67,8 @@ class CoreLine:
                     self._jobs = jobs
                 case LivePath():
                     self.samples.set_path(message.path)
+                case LiveMachine():
+                    self.samples.set_machine(message.machine)
                 case LiveSamples():
                     self.samples.add_samples(message)
                 case Answer():

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from pydantic import TypeAdapter
 
 from abbe.service.channel.messages import LiveSamples
-from abbe.service.domain.progress import RecordedPath
+from abbe.service.domain.progress import MachineReading, RecordedPath
 from abbe.service.errors import ChannelBroken
 
 VERSION = 1
@@ -29,6 +29,7 @@ QUEUE = 40
 MOST_LISTENERS, MOST_EACH = 32, 12
 """Simultaneous listeners, in all and per account: one account cannot shut out the others."""
 _PATH = TypeAdapter(RecordedPath)
+_MACHINE = TypeAdapter(dict[str, MachineReading | None])
 
 
 class SampleBoard:
@@ -37,7 +38,7 @@ class SampleBoard:
     def __init__(self) -> None:
         self._path: RecordedPath | None = None
         self._frames: deque[bytes] = deque(maxlen=KEPT_FRAMES)
-        self._listeners: dict[asyncio.Queue[bytes | None], str] = {}
+        self._listeners: dict[asyncio.Queue[bytes | str | None], str] = {}
         self.dropped = 0
         """Number of frames that were dropped for slow browsers."""
 
@@ -47,6 +48,10 @@ class SampleBoard:
         if path.number:
             self._frames.clear()
         self._publish(b"")
+
+    def set_machine(self, machine: MachineReading | None) -> None:
+        """Pass the state of the machine on to the listeners; None: it is not measured any more."""
+        self._publish(_MACHINE.dump_json({"machine": machine}).decode())
 
     def add_samples(self, samples: LiveSamples) -> None:
         """Pass new samples on to the listeners. Raises ChannelBroken if they cannot be decoded."""
@@ -64,7 +69,7 @@ class SampleBoard:
         """Release all listeners."""
         self._publish(None)
 
-    def _publish(self, frame: bytes | None) -> None:
+    def _publish(self, frame: bytes | str | None) -> None:
         for queue in self._listeners:
             if queue.full():
                 queue.get_nowait()
@@ -73,13 +78,14 @@ class SampleBoard:
 
     @contextmanager
     def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[str | bytes]] | None]:
-        """Subscribe to the kept and all later frames: text (a path as JSON) and binary; yield None if this account or all together have too
-        many listeners.
+        """Subscribe to the kept and all later frames: text (a path or the state of the machine as JSON) and binary.
+
+        Yields None if this account or all together have too many listeners.
         """
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None
             return
-        queue: asyncio.Queue[bytes | None] = asyncio.Queue(QUEUE)
+        queue: asyncio.Queue[bytes | str | None] = asyncio.Queue(QUEUE)
         begun, kept = self._path, b"".join(self._frames)
 
         async def parts() -> AsyncIterator[str | bytes]:

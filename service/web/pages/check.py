@@ -15,7 +15,7 @@ from abbe.service.domain.verification import CheckFigure, Verification
 from abbe.service.errors import AbbeError, NotStored
 from abbe.service.queries.alarms import AlarmPath, alarms_of_check, path_with
 from abbe.service.queries.checks import check as stored_check
-from abbe.service.queries.checks import checks
+from abbe.service.queries.checks import checks, last_good
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import AlarmSummary
 from abbe.service.rendering.model import PolarTrace
@@ -94,7 +94,7 @@ def check_screen(reader: Reader, number: int) -> CheckScreen:
     """A check with its curves. Raises NotStored, Unusable."""
     one = stored_check(reader, number)
     around = [c for c in checks(reader, one.machine, None, number, LOOK_BACK)[0] if c.id < number]
-    good = next((c for c in around if c.verdict == "pass" and c.recipe == one.recipe and not c.push), None)
+    good = last_good(around, one.recipe)
     runs, pictures, trouble = _curves(reader, one, good)
     newer = min((c.id for c in checks(reader, one.machine, None, None, LOOK_BACK)[0] if c.id > number), default=None)
     gauges = [_gauge(one, figure, good) for figure in one.figures if figure.value is not None]

@@ -9,7 +9,8 @@ from datetime import date
 from typing import Annotated
 
 from fastapi import FastAPI, Query
-from fastapi.responses import HTMLResponse
+from fastapi.responses import HTMLResponse, JSONResponse
+from pydantic import AfterValidator
 
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import Rules
@@ -18,10 +19,12 @@ from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.context import PageContext
+from abbe.service.web.pages.context import PageContext, can_be_stored
+from abbe.service.web.pages.last_good import NO_SHAPE, last_good_shape
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
 Recipe = Annotated[str, Query(max_length=200)]
+Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 Rate = Annotated[int, Query(ge=1, le=1000)]
 
 
@@ -62,7 +65,7 @@ def expired_certificates(rules: Rules | None, today: date) -> list[tuple[str, da
 
 SCRIPT_KEYS = (
     "live.abort", "live.ended", "live.gone", "live.old", "live.pause", "live.resume", "live.stop", "live.no_path",
-    "live.of", "live.share_here",
+    "live.of", "live.share_here", "live.before", "live.laser", "live.laser.strip", "live.strip", "live.door.open", "live.door.shut",
 )  # fmt: skip
 """Texts for the script, besides the states and outcomes of a measurement."""
 
@@ -82,6 +85,14 @@ def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequenc
             texts=script_texts(current().lang),
             due_words=lambda one: language.due(current().lang, one.due_utc, status.now_utc),
         )
+
+    @app.get("/live/before", include_in_schema=False)
+    @needs(Permission.READ)
+    async def before(run: Text = "") -> JSONResponse:
+        status = await context.source.status()
+        if status.job is None or not run:
+            return JSONResponse(NO_SHAPE)
+        return JSONResponse(await context.read(last_good_shape, context.reader, status.job.recipe, run))
 
 
 def script_texts(lang: str) -> dict[str, str]:

@@ -1,5 +1,6 @@
 // The live run: two WebSockets (status and samples), two traces, and the buttons that control the run.
 
+import { Machine } from "./machine.js";
 import { Traces, framesOf } from "./traces.js";
 
 const AGAIN_MS = 1000;
@@ -59,6 +60,8 @@ function keepOpen(path, patienceMs, onMessage) {
 
 let now = null;
 let traces = null;
+let machine = null;
+let leftAt = 0;
 
 function showState(state) {
   setText("live-state", words[`measuring.${state}`] ?? state);
@@ -124,14 +127,32 @@ function onStatus(text) {
     return;
   }
   if (now === "over") return;
+  if (event.job.eta_s !== now?.eta_s) leftAt = performance.now();
   now = event.job;
   showState(now.state);
   showProgress();
+  showLeft();
   showPrompt(now.prompt, now.ask);
   if (now.message) setText("live-message", now.message);
   if (now.steps) setText("live-step", words["live.of"].replace("{n}", now.step).replace("{m}", now.steps));
   setText("live-points", String(now.points));
-  setText("live-left", now.eta_s === null ? spans["job.unknown"] : spans["job.left"].replace("{span}", span(now.eta_s)));
+}
+
+// The core tells the time left after each step; in between it runs down here.
+function showLeft() {
+  if (!now || now === "over") return;
+  const left = now.eta_s === null ? null : Math.max(0, now.eta_s - (now.state === "running" ? (performance.now() - leftAt) / 1000 : 0));
+  setText("live-left", left === null ? spans["job.unknown"] : spans["job.left"].replace("{span}", span(left)));
+}
+
+// The last check that passed, along the same path, in grey below the trace.
+async function showBefore(path) {
+  const answer = await fetch(`/live/before?${new URLSearchParams({ run: path.run })}`, { headers: { "X-Abbe-Active": "0" } }).catch(() => null);
+  const before = answer?.ok ? await answer.json() : null;
+  find("live-before").hidden = !before?.values.length;
+  if (!before?.values.length || traces.path !== path) return;
+  setText("live-before", words["live.before"].replace("{n}", before.check));
+  traces.showBefore(before.values);
 }
 
 keepOpen("/api/v1/live", SILENT_MS, onStatus);
@@ -156,16 +177,36 @@ function paint() {
   dispatchEvent(new CustomEvent("live-drawn", { detail: { arrivedMs: newest, count: traces.count } }));
 }
 
+function showMachine(reading) {
+  machine.show(reading);
+  if (traces.running || !machine.hasLaser) return;
+  find("live-pair").classList.add("single");
+  find("live-pair").classList.remove("old");
+  setText("live-note", "");
+  setText("live-run", words["live.laser"]);
+  traces.fit();
+  machine.draw(root.dataset.mmSign);
+}
+
 function onSamples(data) {
   if (typeof data === "string") {
     const path = JSON.parse(data);
+    if (path.machine !== undefined) {
+      showMachine(path.machine);
+      return;
+    }
+    machine.forget();
     setText("live-note", path.number ? "" : words["live.no_path"]);
     if (path.number && path.number !== traces.path.number) {
       traces.begin(path);
       setText("live-run", path.run);
       lastFrame = performance.now();
+      find("live-pair").classList.remove("single");
+      setText("strip-name", words["live.strip"]);
+      showBefore(path);
     }
     traces.running = path.number > 0;
+    find("live-pair").classList.toggle("old", !traces.running);
     return;
   }
   for (const frame of framesOf(data)) {
@@ -182,6 +223,7 @@ function onSamples(data) {
 
 if (shows) {
   traces = new Traces(find("strip"), find("polar"), unit);
+  machine = new Machine(root, words);
   keepOpen("/api/v1/live/samples", Infinity, onSamples);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => { traces.drawStrip(); traces.drawPolar(true); });
 }
@@ -193,7 +235,8 @@ setInterval(() => {
   lost.hidden = !old;
   if (!shows) return;
   if (now !== "over") setText("live-elapsed", span(Number(root.dataset.elapsed) + performance.now() / 1000));
-  const stale = old || (traces.running && performance.now() - lastFrame > OLD_MS);
+  showLeft();
+  const stale = old || (traces.running ? performance.now() - lastFrame > OLD_MS : !machine.hasLaser);
   find("live-pair").classList.toggle("old", stale);
   if (traces.running) setText("live-note", stale ? words["live.old"] : "");
 }, 1000);

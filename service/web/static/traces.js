@@ -6,7 +6,7 @@ const STRIP_S = 20;
 const PARTS = 1440;
 const SCALES = [1, 2, 5].flatMap((first) => [1, 10, 100, 1e3, 1e4, 1e5].map((power) => first * power)).sort((a, b) => a - b);
 
-function colours(canvas) {
+export function colours(canvas) {
   const style = getComputedStyle(canvas);
   const of = (name) => style.getPropertyValue(name).trim();
   return { line: of("--line"), text: of("--quiet"), trace: of("--accent") };
@@ -51,8 +51,15 @@ export class Traces {
     this.least = Infinity;
     this.most = -Infinity;
     this.scale = 0;
+    this.before = null;
     this.drawPolar(true);
     this.drawStrip();
+  }
+
+  // The same path of the last check that passed: one value, in µm, for each equal part of it.
+  showBefore(values) {
+    this.before = values.map((value) => (value === null ? NaN : value / this.unit.size));
+    this.drawPolar(true);
   }
 
   take(first, values) {
@@ -155,10 +162,11 @@ export class Traces {
         pen.fillStyle = paint.text;
         pen.font = `${12 * this.dot}px system-ui, sans-serif`;
         const rings = [[-0.14, `−${this.scale}`], [0, "0"], [0.14, `+${this.scale} ${this.unit.sign}`]];
-        for (const [off, text] of rings) pen.fillText(text, middle + 4 * this.dot, middle - zero - off * width - 4 * this.dot);
+        for (const [off, text] of rings) pen.fillText(text, middle + 4 * this.dot, Math.max(13 * this.dot, middle - zero - off * width - 4 * this.dot));
       }
     }
     if (!this.scale || this.part < 0) return;
+    if (anew && this.before) this.drawBefore(pen, paint.text);
     pen.strokeStyle = paint.trace;
     pen.lineWidth = 1.2 * this.dot;
     pen.beginPath();
@@ -182,6 +190,24 @@ export class Traces {
     }
     pen.stroke();
     this.drawnPart = this.part;
+  }
+
+  drawBefore(pen, colour) {
+    const { width } = this.polar;
+    pen.save();
+    pen.strokeStyle = colour;
+    pen.globalAlpha = 0.6;
+    pen.lineWidth = this.dot;
+    pen.beginPath();
+    let joined = false;
+    for (const [k, value] of this.before.entries()) {
+      const radius = 0.32 * width + (0.14 * width * value) / this.scale;
+      const angle = this.angle((k + 0.5) / this.before.length);
+      if (Number.isFinite(radius)) pen[joined ? "lineTo" : "moveTo"](width / 2 + radius * Math.cos(angle), width / 2 - radius * Math.sin(angle));
+      joined = Number.isFinite(radius);
+    }
+    pen.stroke();
+    pen.restore();
   }
 
   angle(share) {

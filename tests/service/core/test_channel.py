@@ -24,7 +24,7 @@ from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject, Rules
 from abbe.service.domain.machine_file import MachineFileSummary, StatedValue
-from abbe.service.domain.progress import DeviceStatus, RecordedPath, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
 from abbe.service.storage.store import Store
@@ -100,6 +100,19 @@ CORE = [
     ),
     MOMENT,
     m.Jobs("jobs", (JOB, replace(JOB, ended_utc=NOW, verification=7))),
+    m.LiveMachine(
+        "machine",
+        MachineReading(
+            at_ms=1.5,
+            position_mm=(1.0, 2.0, 3.0),
+            feed_mm_min=None,
+            override_percent=100,
+            door_open=False,
+            air_c=20.5,
+            laser_mm=None,
+            beam_good=False,
+        ),
+    ),
     m.LivePath(
         "path",
         RecordedPath(

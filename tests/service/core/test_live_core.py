@@ -9,9 +9,10 @@ from base64 import b64decode
 import numpy as np
 
 from abbe.service.capture.live import LiveFeed
-from abbe.service.channel.messages import LivePath, LiveSamples, Wire, from_core
+from abbe.service.channel.messages import LiveMachine, LivePath, LiveSamples, Wire, encode, from_core
 from abbe.service.clock import SystemClock
 from abbe.service.core.web_process import show_live
+from abbe.service.domain.progress import MachineReading
 from tests.patience import within
 from tests.service.capture.test_live import QUARTER, SETUP, batch
 
@@ -46,6 +47,29 @@ async def test_a_path_its_samples_and_its_end() -> None:
         ended = await hear(web)
         assert isinstance(ended, LivePath)
         assert ended.path.number == 0
+    showing.cancel()
+    await asyncio.gather(showing, return_exceptions=True)
+    core.close()
+    web.close()
+
+
+async def test_the_machine_is_told_while_it_is_measured_and_then_that_it_is_not() -> None:
+    ours, theirs = socket.socketpair()
+    core, web = await Wire.over(ours), await Wire.over(theirs)
+    feed = LiveFeed()
+    showing = asyncio.create_task(show_live(core, feed, SystemClock()))
+    reading = MachineReading(
+        at_ms=0.0, position_mm=(1.0, 2.0, 3.0), feed_mm_min=600.0, override_percent=100, door_open=False, air_c=20.5, laser_mm=None,
+        beam_good=False,
+    )  # fmt: skip
+    with feed.showing(lambda: reading):
+        for _ in range(2):
+            async with asyncio.timeout(within(30)):
+                assert await web.receive() == encode(LiveMachine("machine", reading))
+    async with asyncio.timeout(within(30)):
+        while (body := await web.receive()) == encode(LiveMachine("machine", reading)):
+            pass
+    assert body == encode(LiveMachine("machine", None))
     showing.cancel()
     await asyncio.gather(showing, return_exceptions=True)
     core.close()

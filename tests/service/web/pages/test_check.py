@@ -54,3 +54,18 @@ def test_every_mention_of_a_check_leads_to_it(running: Served) -> None:
         for path in ("/", "/alarm?id=2"):
             assert 'href="/check?id=24"' in client.get(path).text, path
         assert 'data-href="/check?id=24"' in client.get("/trends").text
+
+
+def test_the_live_screen_gets_the_path_of_the_last_good_check(running: Served) -> None:
+    with as_user(running, "olga") as client:
+        assert client.get("/live/before?run=helix").json()["values"] == [], "nothing is measured"
+        running.board.job_started(running.filled.schedules[0], running.store.utcnow())
+        try:
+            labels = [run.label for run in running.store.runs.all() if run.test == "ballbar_helix"]
+            told = client.get("/live/before", params={"run": labels[0]}).json()
+            assert told["check"] == 20
+            assert len(told["values"]) == 250, "two readings in each part"
+            assert all(isinstance(value, float) for value in told["values"])
+            assert client.get("/live/before?run=other").json()["values"] == []
+        finally:
+            running.board.job_ended(None)

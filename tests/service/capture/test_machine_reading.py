@@ -1,0 +1,76 @@
+"""What is told of the machine comes from answers that were asked for anyway: position, feed along the chord, door, air, and the laser."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from typing import Any, cast
+
+import pytest
+
+from abbe.drivers.api import Condition, Controller, ControllerStatus, DisplacementMeter, LaserFlag, LaserReading
+from abbe.service.capture.machine_reading import LatestReading
+from abbe.service.clock import SystemClock
+from abbe.service.devices.session import Session, noted, noted_meter
+
+STATUS = ControllerStatus(100.0, 1_000_000, Condition.MOVING | Condition.REMOTE, (10.0, 20.0, -5.0), 0, 0, 0, 80, 0)
+LASER = LaserReading(100.0, 1, 0, 123_456_789, 900, 0, 20.4, 101_300.0, 45.0, 2.7e-4)
+
+
+class Device:
+    """Answers what it is told to, and counts how often it was asked."""
+
+    def __init__(self, answer: Any) -> None:
+        self.answer, self.asked = answer, 0
+
+    async def status(self) -> Any:
+        self.asked += 1
+        return self.answer
+
+    peek = status
+
+
+def told(now_s: float = 100.0) -> tuple[Device, Device, Session, LatestReading]:
+    cnc, laser = Device(STATUS), Device(LASER)
+    session = Session(noted(cast(Controller, cnc)), None, noted_meter(cast(DisplacementMeter, laser)), None)
+    return cnc, laser, session, LatestReading(session, SystemClock(), lambda: now_s)
+
+
+def test_nothing_is_told_before_the_first_answer_and_nobody_is_asked() -> None:
+    cnc, laser, _, reading = told()
+    assert reading() is None
+    assert (cnc.asked, laser.asked) == (0, 0)
+
+
+def test_the_feed_is_the_way_between_two_positions_and_none_at_standstill() -> None:
+    cnc, _, session, reading = told()
+    asyncio.run(session.controller.status())
+    first = reading()
+    assert first is not None
+    assert (first.position_mm, first.feed_mm_min, first.override_percent, first.door_open) == ((10.0, 20.0, -5.0), None, 80, False)
+    cnc.answer = replace(STATUS, ctrl_us=1_500_000, position_mm=(13.0, 24.0, -5.0))  # 5 mm in half a second
+    asyncio.run(session.controller.status())
+    assert reading().feed_mm_min == pytest.approx(600.0)  # type: ignore[union-attr]
+    cnc.answer = replace(STATUS, ctrl_us=2_500_000, conditions=Condition.DOOR_OPEN)
+    asyncio.run(session.controller.status())
+    last = reading()
+    assert last is not None
+    assert (last.feed_mm_min, last.door_open) == (0.0, True)
+
+
+def test_the_laser_is_told_while_its_answer_is_new() -> None:
+    _, laser, session, reading = told()
+    asyncio.run(session.controller.status())
+    asyncio.run(session.need_laser().peek())
+    now = reading()
+    assert now is not None
+    assert (now.air_c, now.laser_mm, laser.asked) == (20.4, pytest.approx(12.3456789), 1)
+    assert now.beam_good
+    laser.answer = replace(LASER, status=int(LaserFlag.BEAM_LOST))
+    asyncio.run(session.need_laser().peek())
+    lost = reading()
+    assert lost is not None
+    assert not lost.beam_good
+    late = LatestReading(session, SystemClock(), lambda: 106.0)()
+    assert late is not None
+    assert (late.air_c, late.laser_mm, late.beam_good) == (None, None, False)
