@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -69,6 +70,12 @@ class TestReport:
         return {"format": FORMAT} | asdict(self)
 
 
+def prove(url: str) -> str:
+    """Return the remedy for a device whose test is missing or out of date."""
+    bare = re.split(r"[?&]tested=", url)[0]
+    return f'run: abbe device test "{bare}" --out report.json, then add {"&" if "?" in bare else "?"}tested=report.json to the URL'
+
+
 def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ability) -> None:
     """Refuse a device whose report does not prove an ability.
 
@@ -88,7 +95,7 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     NotProved
         No report, of another device or file, or without this ability; the message names the checks that failed or are missing.
     """
-    remedy = f'run: abbe device test "{device.partition("&tested")[0]}" --out report.json, then add &tested=report.json to the URL'
+    remedy = prove(device)
     if not path:
         raise NotProved(device, f"open to {needed}", "its sign, scale and freshness are not proved yet", remedy)
     try:

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import Any, Literal
 
 from abbe.drivers import registry
+from abbe.drivers.described.tested import prove
 from abbe.drivers.errors import DriverError
-from abbe.drivers.links.urls import parse_url
+from abbe.drivers.links.urls import installed, parse_url, split_report
 from abbe.service.campaigns.plausibility import check_plausibility, check_sensors
 from abbe.service.config import LoadedMachine
 from abbe.service.devices.session import lock_machine, no_console
@@ -159,11 +160,18 @@ async def _devices(site: Site) -> AsyncIterator[Examined]:
             yield _failed(role, error)
             continue
         try:
-            yield Examined(role, "good", f"{url}: {await _read(role, device)}")
+            yield _answered(role, url, await _read(role, device))
         except (AbbeError, DriverError) as error:
             yield _failed(role, error)
         finally:
             await device.close()
+
+
+def _answered(role: str, url: str, what: str) -> Examined:
+    """Return the line of a device that answers; the driver of a package that no report proves is to be tested first."""
+    if installed(url) is None or split_report(url)[1]:
+        return Examined(role, "good", f"{url}: {what}")
+    return Examined(role, "look", f"{url}: {what}; its driver is not tested", prove(url))
 
 
 def _failed(role: str, error: AbbeError | DriverError) -> Examined:

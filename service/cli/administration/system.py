@@ -51,6 +51,8 @@ def sim(
     # Its own process group: Ctrl-C reaches the child once, from here, and not again from the terminal.
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     arguments = list(context.args)
+    if {"-h", "--help"} & set(arguments):
+        typer.echo("abbe sim [--machine-file FILE] ...: FILE is a new machine file for it; the other options:")
     if file is not None and file.exists():
         raise ConfigError(f"{file} exists", "remove it, or give another name")
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:

@@ -8,6 +8,7 @@ import json
 import struct
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from zlib import crc32
 
@@ -21,6 +22,8 @@ from abbe.drivers.described.tested import Ability
 from abbe.drivers.errors import BadUrl, NotProved
 from abbe.drivers.links.urls import beside
 from abbe.drivers.registry import open_controller, open_laser
+from abbe.service.config import load_machine
+from abbe.service.jobs.doctor import examine
 from tests.drivers.acme import meter as driver
 
 LONGEST = 150
@@ -73,6 +76,20 @@ async def test_it_passes_the_test_of_devices(device: tuple[Device, str]) -> None
     report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
     assert [one.check for one in report.failed] == ["motion displacement"]
     assert report.failed[0].text.startswith("sign: it grows the wrong way")
+
+
+async def test_the_doctor_says_which_driver_is_not_tested(device: tuple[Device, str], tmp_path: Path) -> None:
+    acme, url = device
+    report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person), "2026-11-26T00:00:00+00:00")
+    (tmp_path / "report.json").write_text(json.dumps(report.to_document()))
+    file = tmp_path / "abbe.toml"
+    for tested, state in (("", "look"), ("?tested=report.json", "good")):
+        file.write_text(
+            'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 600]\nY = [0, 500]\nZ = [0, 450]\n'
+            f'[devices]\nlaser = "{url}{tested}"\n'
+        )
+        (laser,) = [one async for one in examine(load_machine(file), datetime.now(UTC)) if one.what == "laser"]
+        assert (laser.state, "abbe device test" in laser.remedy) == (state, state == "look"), laser
 
 
 Read = Callable[..., Awaitable[LaserReading]]
