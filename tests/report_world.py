@@ -114,7 +114,11 @@ def documents(filled: Filled, factory: pytest.TempPathFactory) -> dict[str, Docu
     with Store.open(filled.url) as store:
         campaign = from_store(store, filled.campaign)
         store.machines.add(filled.machine, campaign.site.doc | {"tool_mm": [0.0, 0.0, 120.0]})  # pushes of the world know only a name
-        found = {f"run {r.label}": stored_report(store, r, RULES) for r in store.runs.all(store.campaigns.find(filled.campaign).id)[::3]}
+        found = {
+            f"run {r.label}": stored_report(store, r, RULES)
+            for r in store.runs.all(store.campaigns.find(filled.campaign).id)
+            if r.id in {1, 8, 14, 18}
+        }
         found |= {"campaign": stored_report(store, store.campaigns.find(filled.campaign), RULES)}
         numbered = (
             ("verification", 1),

@@ -13,12 +13,14 @@ from typing import Any
 import pypdf
 import pytest
 
+from abbe.service.effects.effect_catalogue import catalogue
+from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import FileFormatError
 from abbe.service.rendering import document_page
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_data import document_json, shown
 from abbe.service.rendering.document_page import document_html, document_pdf, write_document
-from abbe.service.rendering.phrases import LANGUAGES
+from abbe.service.rendering.phrases import LANGUAGES, phrase
 from tests.conftest import Require
 from tests.languages import english
 from tests.pages_world import filled_once
@@ -68,6 +70,15 @@ def test_a_pdf_says_what_its_data_say_and_has_letters_for_it(lang: str, reports:
         assert re.search(LETTERS[lang], text), name
         assert words(text) - words(" ".join(texts(shown(own)))) == set(), name
         assert reader.trailer["/Root"]["/Lang"] == lang
+
+
+@pytest.mark.parametrize("lang", OTHERS)
+def test_every_effect_of_the_catalogue_is_told(lang: str) -> None:
+    """Also those that the discovery of the world did not find."""
+    said: set[str] = set(REMEDIES.values())
+    for one in catalogue():
+        said |= {one.title, one.signature, one.remedy_text, one.source, *(f"{one.title} {key}".strip() for key in one.keys)}
+    assert {text: told for text in said if english(lang, told := phrase(lang, text), said)} == {}
 
 
 def squeezed(made: bytes) -> str:
