@@ -17,14 +17,22 @@ def words(text: str) -> set[str]:
 
 
 NAMES = words("mill june late weekly night quick check verify ann VMC auth usb serial modbus dev ballbar laser") | set(USERS)
-NAMES |= words("helix lineX lineY lineZ diagonal ppp npp pnp ppn XYZ ZYX Europe Berlin UTC done user norm cup")
+NAMES |= words("helix lineX lineY lineZ diagonal ppp npp pnp ppn XYZ ZYX Europe Berlin UTC done user norm cup back")
 NAMES |= words("Werk Nord Ringstr Bonn Meier Muster GmbH Talweg dppp dnpp dpnp dppn legendre order heldout numpy scipy typst abbe")
 NAMES |= words("Kakino Pahk Wang Edlén Edl Procedia CIRP sin tau beta")
 """Of authors, formulas, machine, campaigns, runs, schedules, recipes, people, devices, zones and programs of the worlds."""
-REMARKS = ("the colour of the machine", "worse on the gauge block", "look at it")
+REMARKS = (
+    "the colour of the machine",
+    "worse on the gauge block",
+    "look at it",
+    "lease taken",
+    "bank 1 written and read back, equal",
+    "03:38:06 activated",
+    "03:39:51 verified",
+)
 """What people of the world wrote."""
 SHORT = words(
-    "Abbe PIN RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad urad English Deutsch µrad µin"
+    "Abbe PIN RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad English Deutsch µrad µin"
 )
 CODES = (
     r"CAL-[-0-9a-f]+",

@@ -9,7 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.models.planning.measurements import Instruments
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
+from abbe.service.campaigns.plan import plan_for, plan_report
 from abbe.service.compensation.proposal_diff import compare, diff_report
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.discovery.discover import prepare
@@ -19,6 +21,7 @@ from abbe.service.domain.machine import AxisMaterial, Issuer, Item
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.identification.solve_report import assess, solution_of
 from abbe.service.rendering.document import Document
+from abbe.service.report.dry_run_page import dry_run_report
 from abbe.service.report.report import certified, numbered_report, solution_report, stored_report
 from abbe.service.report.report_discovery import simulation_report
 from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report
@@ -117,7 +120,7 @@ def documents(filled: Filled, factory: pytest.TempPathFactory) -> dict[str, Docu
         found = {
             f"run {r.label}": stored_report(store, r, RULES)
             for r in store.runs.all(store.campaigns.find(filled.campaign).id)
-            if r.id in {1, 8, 14, 18}
+            if r.id in {1, 8, 15}
         }
         found |= {"campaign": stored_report(store, store.campaigns.find(filled.campaign), RULES)}
         numbered = (
@@ -134,6 +137,9 @@ def documents(filled: Filled, factory: pytest.TempPathFactory) -> dict[str, Docu
         solved = assess(solved_campaign(factory, filled.machine)[2])
         result = SolutionResult(solution_of(solved), account=solved)
         found["solution"] = solution_report(store, campaign, result, "2026-11-24T06:00:00+00:00", RULES)
+    planned = plan_for(campaign.site, minutes=7.0, tools=Instruments(bar_lengths_mm=(100.0,)))
+    found["plan"] = plan_report(campaign.site, planned)
+    found["dry run"] = dry_run_report(filled.machine, campaign.site.machine, planned.campaign, tuple(planned.dry))
     job = prepare(from_folder(Path(filled.url.removeprefix("sqlite:///")).parent / "c1"), catalogue(), None)
     finding = simulated_finding(job, simulate(job))
     found["simulation"] = simulation_report(job, finding, verdict_line(finding), datetime(2026, 11, 24, tzinfo=UTC).isoformat())

@@ -25,8 +25,12 @@ LONGEST = 2000
 _PLACE = re.compile(r"\{(\w+)\}")
 _SHOWN = re.compile(r'>([^<>]+)<|aria-label="([^"]*)"')
 _WORD = re.compile("[A-Za-z]{2}|/")
-_ENDS = (". ", "; ", ": ", ", ")
-_OWN_ENDS = {"ja": {". ": "。", ", ": "、", ".": "。"}}
+_ENDS = (". ", "; ", ": ", ", the ", " and the ", " or ", ", ")
+_OWN_ENDS = {
+    "de": {", the ": ", ", " and the ": " und ", " or ": " oder "},
+    "ja": {". ": "。", ", ": "、", ".": "。", ", the ": "、", " and the ": "、", " or ": "、または"},
+    "ko": {", the ": ", ", " and the ": ", ", " or ": " 또는 "},
+}
 """How a language writes ends of sentences and parts; others write them as English does."""
 
 
@@ -63,7 +67,7 @@ def phrase(lang: str, text: str) -> str:
     if lang == ENGLISH or len(text) > LONGEST or not _WORD.search(text):
         return text
     bare, ends = text.removesuffix("."), _OWN_ENDS.get(lang, {})
-    said = _fitting(lang, bare) or _of_other_case(lang, bare)
+    said = _fitting(lang, bare) or _within_a_sentence(lang, bare)
     if said is not None:
         return said if bare == text else said + ends.get(".", ".")
     for end in _ENDS:
@@ -86,10 +90,10 @@ def _fitting(lang: str, text: str) -> str | None:
     return None
 
 
-def _of_other_case(lang: str, text: str) -> str | None:
-    """A phrase whose first letter is large where the text's is small, or the reverse."""
-    said = _fitting(lang, text[:1].swapcase() + text[1:])
-    return said if said is None or text[:1].islower() else said[:1].upper() + said[1:]
+def _within_a_sentence(lang: str, text: str) -> str | None:
+    """A phrase with a small first letter that begins a sentence here."""
+    said = _fitting(lang, text[:1].lower() + text[1:]) if text[:1].isupper() else None
+    return None if said is None else said[:1].upper() + said[1:]
 
 
 def pictured(lang: str, svg: str) -> Markup:

@@ -185,6 +185,11 @@ def _frame_of(request: HTTPConnection, paths: frozenset[str] | None) -> tuple[di
     return chosen_now, Frame(chosen["lang"], path, query, visit, chosen["theme"], chosen["units"], paths)
 
 
+def language_of(request: HTTPConnection) -> str:
+    """The language that a request chooses, its cookie holds or its header prefers."""
+    return _frame_of(request, None)[1].lang
+
+
 @contextmanager
 def frame_for(request: HTTPConnection) -> Iterator[None]:
     """Set the frame of a request that is answered outside of `FrameMiddleware`."""

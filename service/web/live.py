@@ -5,14 +5,18 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable
 from contextlib import suppress
+from dataclasses import replace
 
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from pydantic import TypeAdapter
 
+from abbe.service.domain.progress import RunningCheck
 from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.status import LiveEvent
+from abbe.service.rendering.phrases import phrase
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.frame import language_of
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 
@@ -33,10 +37,11 @@ def add_live(app: FastAPI, core: CoreLine) -> None:
                 await socket.close(TRY_AGAIN)
                 return
             await socket.accept()
+            lang = language_of(socket)
 
             async def send_events() -> None:
                 async for snapshot in snapshots():
-                    text = _event(core, snapshot.changes)
+                    text = _event(core, snapshot.changes, lang)
                     if text is not None:
                         await socket.send_text(text)
 
@@ -86,12 +91,18 @@ async def _disconnected(socket: WebSocket) -> bool:
     return bool(message["type"] == "websocket.disconnect")
 
 
-def _event(core: CoreLine, revision: int) -> str | None:
-    """The current event as JSON; None while the core is silent."""
+def _event(core: CoreLine, revision: int, lang: str) -> str | None:
+    """The current event as JSON, sentences in the reader's language; None while the core is silent."""
     try:
-        event = LiveEvent(
-            revision=revision, job=core.job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=core.attention
-        )
+        attention = [phrase(lang, text) for text in core.attention]
+        job = _told(core.job, lang)
+        event = LiveEvent(revision=revision, job=job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=attention)
     except CoreUnavailable:
         return None
     return _EVENT.dump_json(event).decode()
+
+
+def _told(job: RunningCheck | None, lang: str) -> RunningCheck | None:
+    if job is None:
+        return None
+    return replace(job, ask=phrase(lang, job.ask), message=phrase(lang, job.message), why=phrase(lang, job.why))

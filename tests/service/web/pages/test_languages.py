@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import re
 from html import unescape
 
 import pytest
 
+from abbe.drivers.fixture.driver import ConsoleFixture
 from abbe.service.rendering.phrases import FOLDER, LANGUAGES, phrase, pictured
 from tests.languages import english
 from tests.pages_world import as_user, filled_once, screens, served
@@ -34,7 +36,7 @@ def test_every_screen_is_in_its_language(tmp_path_factory: pytest.TempPathFactor
             for path, found in read[lang].items():
                 originals = frozenset(read["en"][path])
                 left |= {f"{lang} {text}": path for text in found if english(lang, text, originals)}
-    assert "\n".join(f"{text}  {where}" for text, where in sorted(left.items())) == ""
+    assert not left, "\n".join(f"{text}  {where}" for text, where in sorted(left.items()))
 
 
 def test_a_report_of_the_page_is_in_the_readers_language(tmp_path_factory: pytest.TempPathFactory) -> None:
@@ -57,6 +59,27 @@ def test_a_phrase_tells_its_parts_and_leaves_what_it_does_not_know(lang: str) ->
     assert phrase(lang, "At 06:00 on Monday") == weekly[lang]
     ended = {"de": "Entfernt sich von der Grenze. Abc.", "ja": "限界から遠ざかっている。Abc.", "ko": "한계에서 멀어짐. Abc."}
     assert phrase(lang, "Moves away from the limit. Abc.") == ended[lang]
+
+
+@pytest.mark.parametrize("lang", OTHERS)
+def test_every_prompt_of_the_fixture_is_told(lang: str) -> None:
+    """With the position of the spindle before it, as a campaign from the page shows it."""
+    asked: list[str] = []
+
+    async def ask(text: str) -> None:
+        asked.append(f"Spindle at X 10.0 mm Y -2.5 mm Z 0.0 mm. {text}")
+
+    async def every(fixture: ConsoleFixture) -> None:
+        await fixture.mount_ballbar(150.0)
+        await fixture.take_out_ballbar()
+        await fixture.change_ballbar(100.0)
+        await fixture.mount_laser((0.6, -0.8, 0.0))
+        await fixture.mount_artefact((1.0, 2.0, 3.0), ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0.0, 1.0)))
+        await fixture.unmount()
+
+    asyncio.run(every(ConsoleFixture(ask)))
+    assert len(asked) == 6
+    assert [told for text in asked if english(lang, told := phrase(lang, text), asked)] == []
 
 
 def test_a_picture_tells_its_texts() -> None:
