@@ -171,4 +171,4 @@ class OneBankTables:
         conditions = (await self._c.status()).conditions
         wrong = (conditions & FORBIDDEN) | (NEEDED & ~conditions)
         if wrong:
-            raise Refused("one table", "exchange", f"not safe now: {str(wrong.name).replace('|', ', ').lower()} is not as needed")
+            raise Refused("one table", "exchange", f"not safe now; wrong state of {str(wrong.name).replace('|', ', ').lower()}")

@@ -75,13 +75,13 @@ def machine_text(
     doc : dict
         The machine as exchange files have it: name, chain, stroke_mm, tool_mm; optional vertical_axis and pivots_mm.
     urls : DeviceUrls
-        Addresses; a device without one is a comment.
+        Addresses; a device without one gets a comment instead.
     certificates : dict, optional
-        Last day of the certificate of ``ballbar`` and ``laser``; one without is a comment.
+        Last day of the certificate of ``ballbar`` and ``laser``; an instrument without one gets a comment instead.
     limits : PushLimits, optional
-        Limits of a table, where they are not the defaults.
+        Limits of a table; only those that differ from the defaults are written.
     verify : bool
-        With limits of a check, which decide whether the machine passes.
+        Also write the limits of a check, which decide whether the machine passes.
     """
     known = certificates or {}
     return TEXT.format(

@@ -125,7 +125,7 @@ class MeterProbe:
 
 
 class ControlProbe:
-    """The positions of a control."""
+    """A control; its samples are the positions that its status reports."""
 
     moved: tuple[str, ...] = ("x", "y", "z")
 

@@ -400,8 +400,9 @@ class Change:
 class Changed:
     """All changes found.
 
-    ``before_mm``: rms of readings minus the old solution. ``after_mm``: the same with the changes that the OTHER half of the set-ups chose.
-    ``judged``: gain in log likelihood of each half by the other's choice, the smaller of both. Too few set-ups: these three are None.
+    The set-ups are split in two halves, and each half is judged with the changes that the other half chose. ``before_mm``: rms of readings
+    minus the old solution; ``after_mm``: the same with the changes; ``judged``: gain in log likelihood, the smaller of both halves. With
+    too few set-ups these three are None.
     ``floor_mm``: rms noise. ``hidden``: bound on each change of scale (m/m) or squareness (rad) that was not named but would show.
     """
 

@@ -146,10 +146,10 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
 
 
 def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], list[list[Rival]]]:
-    """Replace each named effect that a rival explains better; return the findings with their rivals.
+    """Replace each named effect by a rival if the rival explains the readings better; return the findings with their rivals.
 
-    The search compares effects without the deviations from their formulas (`Form`), so it may have chosen the wrong one of two similar
-    effects. Here both may use them.
+    The search compares effects in their textbook form, so it may have chosen the wrong one of two similar effects. Here both may deviate
+    from it (`Form`).
     """
     changed = False
     for i in range(len(found)):

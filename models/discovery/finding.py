@@ -269,7 +269,7 @@ def finding(
 
 
 def doubted(found: Discovery, mixed: MixedUp) -> Discovery:
-    """Turn a result without effects into the suspicion of readings under the wrong label, before any effect is named."""
+    """Replace a result by the suspicion that some readings have the wrong label. No effect is named until that is settled."""
     whose = " and ".join(mixed.runs)
     doubt = f"the readings of {whose} are probably {mixed.how}: put right, {mixed.remains:.0%} of the misfit of all runs remains"
     location = Localization(runs=mixed.runs, table=found.location.table)

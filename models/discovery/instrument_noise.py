@@ -102,9 +102,9 @@ def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colou
 
 
 def comes_back(paths: Sequence[Path], residual: Sequence[F1], kind: str) -> bool:
-    """Whether residuals of an instrument repeat in runs along the same path (`AGAIN`), so that they are not noise; True without such runs.
+    """Whether residuals of an instrument are alike in runs along the same path: then they are not noise.
 
-    ``residual``: one array (n,) per run.
+    The limit is a mean correlation of `AGAIN`. Without two runs along one path the answer is True. ``residual``: one array (n,) per run.
     """
     runs = [(p, r) for p, r in zip(paths, residual, strict=True) if p.kind == kind and p.n >= SHORTEST]
     alike = [
@@ -170,7 +170,7 @@ def level(
 def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1) -> dict[str, Colour]:
     """Estimate the noise of each instrument from differences of neighbours alone, which hold hardly any effect; arguments as in `level`.
 
-    An effect that is sharp or dense in one run is not in all others, so the noise is that of the instrument's quiet runs (`QUIET`).
+    The noise is that of the instrument's quiet runs (`QUIET`): an effect may be sharp or dense in some runs, but not in all.
     Instruments without runs of `SHORTEST` readings are left out.
     """
     found: dict[str, list[float]] = {}

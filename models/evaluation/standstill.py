@@ -32,10 +32,11 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Standstill:
-    """Result of a test. ``since_start``: the better model takes changes since the start of each run; ``left_out``, ``response``: of it.
+    """Result of a test; ``response`` and ``left_out`` belong to the model that predicts better.
 
-    ``shift_absolute``, ``shift_since_start``: an offset of some runs that temperatures as they are do not explain, and one that changes of
-    temperature do not; None without one. The zero of each run decides which of them shows.
+    ``since_start``: that model uses changes of temperature since the start of each run, otherwise it uses absolute temperatures.
+    ``shift_absolute``, ``shift_since_start``: an offset of some runs that the model with absolute temperatures, or with changes, does not
+    explain; None: no such offset.
     """
 
     since_start: bool

@@ -20,7 +20,10 @@ SQUARENESS = ((0, 1), (0, 2), (1, 2))
 
 @dataclass(frozen=True, slots=True)
 class Monomial:
-    """One term: u_j**power in delta_ij (kind "d", mm) or eps_ij ("e", rad), or the squareness of axes i and j ("S", rad, power 1)."""
+    """One term of an error motion of axis j: position of the axis to ``power``, in delta_ij (kind "d", mm) or eps_ij ("e", rad).
+
+    Kind "S" is the squareness of axes i and j (rad, power 1).
+    """
 
     kind: Kind
     i: int

@@ -300,7 +300,7 @@ def candidates(machine: Machine, tools: Instruments, vertical: int = 2) -> tuple
     Parameters
     ----------
     vertical : int
-        Index of the vertical axis: hemispheres open along it if the tool does not show the side of the spindle (`opening`).
+        Index of the vertical axis. Hemispheres open upwards along it if the tool vector does not show where the spindle is (`opening`).
 
     Raises
     ------

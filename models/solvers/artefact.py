@@ -41,10 +41,10 @@ SAME_PLACE_MM = 0.5
 
 @dataclass(frozen=True, slots=True)
 class Fine:
-    """Fine structure of one axis' motion that no polynomial follows: an unknown in mm.
+    """Fine structure of one axis' motion that no polynomial follows: one unknown, mm, in direction ``component``.
 
-    ``component``: direction that it moves; ``period_mm`` above 0: ``phase`` 0 cosine, 1 sine of the position; else a value of its own for
-    all points whose axis stands within `SAME_PLACE_MM` of ``at_mm``. ``size_mm``: prior standard deviation; 0: the usual one.
+    With ``period_mm`` above 0 it is a wave over the position: cosine (``phase`` 0) or sine (1). Otherwise it is one displacement of all
+    points within `SAME_PLACE_MM` of ``at_mm``. ``size_mm``: prior standard deviation; 0: the default.
     """
 
     axis: int

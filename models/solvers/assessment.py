@@ -191,7 +191,7 @@ class MapAgainstPrior:
 
     @property
     def carried(self) -> bool:
-        """Whether the readings carry the map: no reading makes a machine less known than the priors do."""
+        """Whether the readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times that."""
         return self.u_mm <= self.prior_mm and self.predicted_mm <= LARGEST_MAP * self.prior_mm
 
 

@@ -134,7 +134,7 @@ def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...
 
 
 def total(parts: tuple[InformationSums, ...]) -> InformationSums:
-    """All folds together."""
+    """Return the sums over all folds."""
     return InformationSums(
         np.sum([s.gram for s in parts], axis=0),
         np.sum([s.rhs for s in parts], axis=0),

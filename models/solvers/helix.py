@@ -37,9 +37,9 @@ class HelixSolution:
     estimate : ParameterEstimate
         Six parameters (mm/mm, rad; ISO signs, workpiece coordinates), set-up (mm), and with `fit_run` lost motion (mm).
     identifiability : Identifiability
-        Of the readings without any prior, columns of unit length.
+        Rank and null space of the readings without any prior; the columns of the design are scaled to unit length.
     unknowns : "six" | "nine" | "ten"
-        Six parameters of the machine; cup offset in addition; bar length in addition.
+        "six": parameters of the machine; "nine": also the cup offset; "ten": also the bar length.
     """
 
     estimate: ParameterEstimate

@@ -191,7 +191,7 @@ def taking_part(names: tuple[str, ...], null_space: F2) -> frozenset[str]:
 
 
 def combinations_of(names: tuple[str, ...], null_space: F2) -> tuple[Combination, ...]:
-    """A null space, shape (p, k), as sparse combinations with their text."""
+    """Return the directions of a null space, shape (p, k), as combinations of few parameters each, with a sentence about each."""
     return tuple(_sentence(names, v) for v in sparse_rows(null_space.T))
 
 

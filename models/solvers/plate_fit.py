@@ -27,8 +27,9 @@ NAMES = ("EXX", "EYY", "C0Y", "swirl")
 class PlateFit:
     """Fit of a plate of ``holes`` points.
 
-    ``offset_mm`` (2,), ``rotation_rad`` as printed by a CMM (measured against nominal); ``value`` and ``expanded`` of `NAMES`: scales and
-    squareness (obtuse positive, rad), swirl as mm at the farthest hole at ``reach_mm``; ``rms_mm`` of what is left of a component.
+    ``offset_mm`` (2,), ``rotation_rad``: position of the plate as a CMM prints it (measured minus nominal). ``value``: quantities `NAMES`,
+    that is, two scales (m/m), squareness (rad, positive: obtuse) and swirl (mm at the farthest hole, ``reach_mm`` from the centre);
+    ``expanded``: their expanded uncertainties. ``rms_mm``: rms residual of one component.
     """
 
     label: str

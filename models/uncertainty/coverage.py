@@ -23,7 +23,7 @@ def effective_dof(variances: F2, dof: F1) -> F1:
     variances : array, shape (s, m)
         Variance of each of s sources in each of m results.
     dof : array, shape (s,)
-        Degrees of freedom of each source's variance; inf where it is stated.
+        Degrees of freedom of each source's variance; inf for a variance that is known exactly.
 
     Returns
     -------

@@ -74,7 +74,7 @@ def budget_at(prediction: Prediction, index: int) -> Budget:
 
 
 def budget_over(prediction: Prediction) -> Budget:
-    """Budget over all predicted points, best a grid over the volume: mean variances, so root-mean-square uncertainties."""
+    """Budget of the mean variance over all predicted points, that is, of the rms uncertainty. Points should be a grid over the volume."""
     return _budget(prediction, np.arange(len(prediction.points_mm)))
 
 

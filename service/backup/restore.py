@@ -117,7 +117,9 @@ def _prove(part: Path, backup: Path) -> int:
     """Prove that a copied backup is whole, of a known schema, and unchanged; return its number of audit records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
-        raise BackupRefused(f"{backup} has schema {revision}, which this version of Abbe does not know", "use the Abbe that wrote it")
+        raise BackupRefused(
+            f"{backup} has schema {revision}, which this version of Abbe does not know", "use the version of Abbe that wrote it"
+        )
     key = part / KEY
     records, found = audit_faults(part / DATABASE, part / HEADS, key if key.exists() else None)
     if records and not key.exists():

@@ -44,7 +44,10 @@ async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
 
 
 class BarBreaks:
-    """Handles loss of the ball-bar's box in a test. Without ``ballbar`` in the conditions of ``suspending``, it ends the measurement."""
+    """Waits for the ball-bar's box if its link is lost during a test.
+
+    Only if the conditions of ``suspending`` contain ``ballbar``; otherwise the loss ends the measurement.
+    """
 
     def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
         self._bar, self._control, self._suspending = session.ballbar, control, suspending

@@ -176,7 +176,7 @@ class Drafter:
         return dict(self._numbers), dict(self._counts), replace(self._stream)
 
     def reset(self, mark: object) -> None:
-        """Undo the numbering since `mark`, whose records did not reach the disk."""
+        """Return to the numbering at `mark`, because the records since then did not reach the disk."""
         assert isinstance(mark, tuple)
         self._numbers, self._counts, self._stream = mark
 

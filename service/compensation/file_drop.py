@@ -219,7 +219,8 @@ def receipt(source: Path) -> Drop:
 def _lying_there(source: Path) -> Drop:
     made = receipt(source)
     if made.state not in ("written", "confirmed") or _sums(contents(source)) != made.files:
-        raise FileFormatError(f"{source}: these are not the files that lie at the control ({made.state})", "drop them again")
+        what = f"{source}: these are not the files that were dropped at the control ({made.state})"
+        raise FileFormatError(what, "drop them again: abbe comp drop")
     return made
 
 

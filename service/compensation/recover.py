@@ -235,7 +235,8 @@ async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
     at = _address(journal) or "an address not noted"
     raise TableMismatch(
         f"push {journal[-1].push} of {_name(journal, site)!r} was begun at {at} and has not ended, and its table is not in force here",
-        "start with that machine's file; or, if this is that machine and its table is right: `abbe accept-table -m MACHINE.toml --yes`; "
+        f"start with the file of {_name(journal, site)!r}; if this is that machine and its table is right: "
+        "`abbe accept-table -m MACHINE.toml --yes`; "
         "nothing was written",
     )
 

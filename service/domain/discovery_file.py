@@ -104,7 +104,10 @@ class FoundThinning(FileObject):
 
 
 class FoundLeftOut(FileObject):
-    """Without holdout runs: rms of blocks of the fitted runs, µm, each predicted by a fit to the other blocks. All chose the names."""
+    """Cross-validation if there are no holdout runs: rms residual, µm, of blocks of readings, each predicted by a fit to the other blocks.
+
+    All blocks took part in choosing the names.
+    """
 
     before_um: float = Field(ge=0)
     after_um: float = Field(ge=0)

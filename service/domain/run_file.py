@@ -92,7 +92,8 @@ class RunFile(RunFileHead):
                 raise ValueError(f"key 'setup.{key}' is missing, expected for a run of test {self.test!r}")
         if self.columns.deviation_mm is None and self.role != "sealed":
             raise ValueError(
-                f"columns.deviation_mm: expected a list of numbers, got null (only a run of role 'sealed' may, this is {self.role!r})"
+                "columns.deviation_mm: expected a list of numbers, got null "
+                f"(only a run of role 'sealed' may have null, this one is {self.role!r})"
             )
         return self
 

@@ -1,4 +1,4 @@
-"""The answer of runs at standstill (``abbe-standstill/1``) as pydantic models: what `abbe discover --json` writes for them."""
+"""Pydantic models of ``abbe-standstill/1``: what `abbe discover --json` writes for runs at standstill."""
 
 from __future__ import annotations
 

@@ -230,9 +230,9 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
 
 
 def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssue | None:
-    """Return a flag if the 21 error motions are larger, or less known, than before any reading: the runs do not support them.
+    """Return a flag if the runs do not support 21 error motions: the solved motions are larger, or less certain, than the priors.
 
-    ``instead``: what is done about it, added to the text.
+    ``instead``: what Abbe does about it; the text ends with it.
     """
     found = None if joint.model == "rigid6" else map_against_prior(joint)
     if found is None or found.carried:

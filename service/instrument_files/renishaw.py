@@ -204,7 +204,7 @@ def _run_count(parts: _Sections, *, both: bool) -> int:
     file, lines = parts.file, parts.runs.lines
     at = lines[0][0] if lines else parts.runs.at
     if len(lines) != 1 or not re.match(r"run-count\s*:", lines[0][1], re.IGNORECASE):
-        raise file.wrong(at, "RUNS:: has to hold one line, Run-count")
+        raise file.wrong(at, "section RUNS:: must have exactly one line, Run-count")
     count = _whole(file, at, lines[0][1].partition(":")[2].strip(), "Run-count")
     if both and count % 2:
         raise file.wrong(at, f"Run-count is {count}: a test in both directions has an even number of runs, its last run back is missing")

@@ -1,7 +1,7 @@
 """MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for the sequence numbers.
 
-`Agent` implements an MTConnect agent without assets, and without XPath (``path``) and streaming (``interval``). It observes at each
-request: it misses changes of a running check between two requests, but no ended check, unless more than ten end between two requests.
+`Agent` implements an MTConnect agent without assets, and without XPath (``path``) and streaming (``interval``). It observes the
+machine at each request. Of the time between two requests it reports all ended checks, ten at most, but not the changes of a running one.
 """
 
 from __future__ import annotations

@@ -328,7 +328,7 @@ class StoreBook:
         return cls(store, chain, clock, last.push + 1, last.digest, ())
 
     async def entries(self) -> Journal:
-        """The push so far."""
+        """Return the entries of this push so far, oldest first."""
         return self._journal
 
     async def append(self, journal: Journal, state: PushState, doc: Doc) -> PushEntry:

@@ -70,7 +70,10 @@ MOST_PATHS = 5
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathStep:
-    """One step. ``number``: of its alarm, check, search, proposal or push, None before it exists; ``recipe``: to measure for it."""
+    """One step.
+
+    ``number``: number of its alarm, check, search, proposal or push; None before that exists. ``recipe``: recipe that the step measures.
+    """
 
     key: Step
     state: StepState

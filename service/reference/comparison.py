@@ -113,7 +113,7 @@ class Comparison:
 
     @property
     def within(self) -> float | None:
-        """Largest difference that this status allows; None for a bound and without a computation."""
+        """Largest difference that this status allows; None if the printed number is a bound, or if there is no computation."""
         if self.computed is None or self.expected.bound:
             return None
         if self.fit == "padding":

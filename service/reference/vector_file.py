@@ -19,7 +19,7 @@ LAYOUT = "compare the file with the layout of the reference vectors"
 
 
 class VectorResult(set[Path]):
-    """Paths of the numbers read so far, and of the last part accessed (for messages)."""
+    """Records which parts of a file were read: the paths of all numbers, and in ``last`` the path of the latest part, for messages."""
 
     last: Path = ()
 

@@ -110,7 +110,7 @@ class Document:
     ``not_observable``: errors that this measurement could not show, None without a measurement; ``appendix``: pictures and tables after the
     figures; ``provenance``: versions and hashes; ``signatures``: roles that sign, empty for a working paper; ``days``: first and last day
     of the measurement (ISO 8601), None if not on record; ``issuer``, ``item``, ``issued``: laboratory, machine and day of a certificate;
-    ``lang``: of page and PDF. The texts are English here; `abbe.service.rendering.phrases` tells them, and files for programs keep them.
+    ``lang``: language of page and PDF. The texts here are English; `abbe.service.rendering.phrases` translates them.
     """
 
     kind: Kind

@@ -1,9 +1,9 @@
-"""English sentences (stored verdicts and remarks, reports, pictures) in the reader's language.
+"""Translate English sentences (stored verdicts and remarks, reports, pictures) to the reader's language.
 
-A file of the folder ``phrases`` maps English patterns to the same in each language: ``"{n} runs"`` fits "17 runs", and the same rules
-translate what stands in the braces. A place holds no end of a sentence, and one with a name of one letter no blanks. A phrase has no full
-stop at its end. What no pattern knows is tried sentence by sentence and part by part, and stays English otherwise, so that nothing is lost;
-tests walk all screens and reports and find what has none.
+A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the braces is
+translated by the same rules. It never contains the end of a sentence; if its name has one letter, it contains no blanks. A phrase has no
+full stop at its end. A text without a pattern is split into sentences and their parts, and each part is tried; a part without a pattern
+stays English. Tests search all screens and reports for texts without a pattern.
 """
 
 from __future__ import annotations

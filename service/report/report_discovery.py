@@ -190,9 +190,9 @@ def _card(effect: EffectFound) -> dict[str, str]:
 
 
 def gap_table(finding: Finding) -> TextTable:
-    """Table of the gap (measured minus simulated) by role of the runs; a closed share only of runs that were never fitted.
+    """Return the table of the gap (measured minus simulated), one row per role of runs.
 
-    Sealed runs are only counted: their readings are unknown here.
+    Fitted runs get no closed share, because fitting flatters them. Sealed runs are only counted: their readings are unknown here.
     """
     only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap
     by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"

@@ -142,7 +142,7 @@ def sync_edges(samples: Sequence[BarSample], start: RunStart) -> Edges | None:
 
 
 def starts_in_stream(samples: Sequence[BarSample]) -> bool:
-    """Whether the sample before the first one on the path exists, so that the start of the path is known to one period."""
+    """Whether the stream contains the sample just before the path. Then the path's start is known to one sample period."""
     first = next((k for k, sample in enumerate(samples) if on_path(sample.status)), 0)
     return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
 
@@ -234,7 +234,8 @@ def _check_durations(device_us: npt.NDArray[np.int64], path_us: tuple[int, int],
     tolerance_s = DURATION_TOLERANCE * controller_s + 2.0 / rate_hz
     if abs(device_s - controller_s) > tolerance_s:
         raise MeasurementFault(
-            f"feed changed during the run, or its ends were lost: the bar saw {device_s:.3f} s of it, the controller {controller_s:.3f} s",
+            "feed changed during the run, or its first or last samples were lost: "
+            f"it took {device_s:.3f} s by the ball-bar, {controller_s:.3f} s by the controller",
             "measure the run again with a steady connection and the feed override at 100 %",
         )
     if abs(device_s - planned_s) > tolerance_s:

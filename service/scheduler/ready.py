@@ -134,7 +134,7 @@ class Ready:
 
 
 class AlwaysReady:
-    """Preconditions of timetables that have none."""
+    """Stand-in for timetables without preconditions: always ready."""
 
     async def lack(self, schedule: Schedule) -> str:
         """Return an empty sentence: every precondition is met."""

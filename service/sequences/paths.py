@@ -60,7 +60,7 @@ async def _stop(controller: Motion, stopped: asyncio.Event, spare: Spare | None)
 
 
 def with_warning(error: BaseException) -> BaseException:
-    """Return the same kind of error with a warning that the axes may still move; errors without a detail get a note."""
+    """Add the warning that the axes may still move: in the detail of an error of Abbe, as a note (PEP 678) on any other error."""
     if isinstance(error, AbbeError | DriverError):
         if UNDELIVERED in error.detail:
             return error

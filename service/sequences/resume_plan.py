@@ -384,7 +384,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
     if k is None:
         raise SetupDisturbed(
             f"another campaign mounted the set-up of test {test.label}, and this one cannot mount it anew",
-            "clear it away and begin again",
+            "remove the instrument and start a new campaign",
         )
     opening: tuple[Step, ...] = (Unmount(), *(s for s in first.steps[: k + 1] if not isinstance(s, Unmount)))
     if not any(isinstance(step, MountBar) for step in opening):

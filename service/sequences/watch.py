@@ -183,8 +183,10 @@ async def watched(session: Session, control: Control, watching: Watching) -> Asy
 
 
 class Beside:
-    """Runs tasks beside a block of code; their first failure cancels the block. Unlike a TaskGroup it never takes an outside cancellation
-    for its own: both may come while the axes are being stopped."""
+    """Runs tasks beside a block of code; their first failure cancels the block.
+
+    Unlike a TaskGroup it tells its own cancellation from one that comes from outside. Both may come while the axes are being stopped.
+    """
 
     def __init__(self, block: asyncio.Task[Any]) -> None:
         self._block, self._open, self._cancelled = block, True, False

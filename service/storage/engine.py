@@ -298,7 +298,7 @@ def _require_known(engine: Engine, revision: str | None) -> None:
     if revision is not None and revision not in known_revisions():
         raise StoreError(
             f"database {mask_secrets(str(engine.url))} has schema {revision}, which this version of Abbe does not know",
-            "use the Abbe that wrote it, or another database",
+            "use the version of Abbe that wrote it, or another database",
         )
 
 

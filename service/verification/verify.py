@@ -39,7 +39,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class VerificationFigures:
-    """Figures of one verification: body diagonals by name, and the helix; or an artefact's poses in place of diagonals (``of``).
+    """Figures of one verification: body diagonals by name, and the helix. ``of``: ``diagonals`` may instead hold an artefact's poses.
 
     ``air_c``: lowest and highest air temperature, None without any reading. ``tables``: CRC of every table that was active during its runs;
     None stands for a run that does not record it.

@@ -60,7 +60,7 @@ def has_uplot() -> bool:
 
 
 def plot_files() -> Markup:
-    """The tags that load it and our script; nothing without it."""
+    """Return the HTML tags that load the curve library and our script; empty if the library was not fetched."""
     if not has_uplot():
         return Markup("")
     css, library, ours = "/static/uplot/uPlot.min.css", "/static/uplot/uPlot.iife.min.js", "/static/plot.js"

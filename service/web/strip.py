@@ -36,7 +36,7 @@ class Strip:
 
 
 def strip_of(status: Status | None) -> Strip:
-    """The status bar of a status; without one the state is not known, and Stop works all the same."""
+    """Return the status bar; without a status it says that the state is unknown. Stop works in both cases."""
     frame = current()
     if status is None:
         return Strip("?", frame.translate("strip.unknown"), "bad")

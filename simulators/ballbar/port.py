@@ -102,7 +102,7 @@ class TcpPort:
         return f"socket://127.0.0.1:{self._port}"
 
     def room(self) -> int:
-        """Return the room in the buffer; none without a host."""
+        """Return how many bytes the buffer can still take; 0 if no host is connected."""
         if self._writer is None:
             return 0
         return max(0, BUFFER_BYTES - self._writer.transport.get_write_buffer_size())

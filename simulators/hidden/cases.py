@@ -43,7 +43,10 @@ class FittedRuns:
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:
-        """Yield, for each tau (s), the readings of a displacement along one axis: ``arm(position (n, 3))`` times 1 - exp(-t / tau)."""
+        """Yield the readings of a displacement along an axis that grows as 1 - exp(-t / tau), for each time constant tau (s).
+
+        ``arm``: final displacement at positions, shape (n, 3).
+        """
         for tau in taus:
             yield self.stack(lambda r, tau=tau: _warm(r, direction, arm, tau))  # type: ignore[misc]
 

@@ -82,7 +82,7 @@ class Hidden:
         return np.random.default_rng([STREAM_WILD, self.stream, *stream])
 
     def freedom(self, low: float, high: float, which: int, *, signed: bool = False) -> float:
-        """Return a departure from the textbook form, drawn between ``low`` and ``high`` times ``bent``; 0 if ``wild`` is 0.
+        """Return a departure from the textbook form: a random number between ``low`` and ``high``, times `bent`; 0 if `wild` is 0.
 
         ``which``: number of the departure, unique within the effect. ``signed``: it is negative in half of the cases.
         """

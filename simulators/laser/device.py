@@ -42,7 +42,10 @@ class Output:
 
 @dataclass(frozen=True, slots=True)
 class Mount:
-    """Laser and mirror as set up: unit ``beam`` (true, away from the laser), ``normal`` of the mirror unturned, zero position (mm)."""
+    """Laser and mirror as set up, in workpiece axes.
+
+    ``beam``: true unit vector, away from the laser; ``normal``: normal of the mirror before the tool turns; ``zero_mm``: zero position.
+    """
 
     beam: F
     normal: F

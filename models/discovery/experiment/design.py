@@ -72,7 +72,7 @@ class Prospect:
 
     @property
     def plain(self) -> bool:
-        """Whether the addition is not special (`ExperimentOffer.special`) and separates every rival that is not separated already."""
+        """Whether the addition is ordinary (not `ExperimentOffer.special`) and separates every rival that is still to be separated."""
         open_ = self.already < SEPARATED
         return not self.offer.special and bool((self.sigmas[open_] >= SEPARATED).all() and open_.any())
 

@@ -62,7 +62,7 @@ def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Return columns of a wave: for ``"EYX"`` in direction Y along X with pitch ``pitch_mm``."""
+    """Return columns of a wave with pitch ``pitch_mm``; ``key`` ``"EYX"``: a displacement along Y, as X moves."""
     axis = AXES.index(key[2])
     return read_together(paths, lambda at: _along(key[1], _turns(at.q_mm[:, axis] / values["pitch_mm"])))
 

@@ -89,7 +89,7 @@ def _flat(axes_mm: F2, p: ArtefactPoints, keep: list[int]) -> _Pose:
 
 
 def stated_places(axes_mm: F2, matrix: F2, nominal_mm: F2, keep: list[int]) -> F2:
-    """Return the positions (n, 2) in the plane of the axes ``keep`` as stated; the found positions differ by the errors themselves."""
+    """Return the nominal positions of the points in the plane of axes ``keep``, shape (n, 2), mm, centred on the measured ones."""
     lies = nominal_mm[:, :2] @ matrix[keep][:, :2].T
     return np.asarray(lies + (axes_mm[:, keep] - lies).mean(axis=0))
 

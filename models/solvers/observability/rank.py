@@ -54,8 +54,8 @@ def as_meant(run: RunData) -> RunData:
 
     A nearly straight path (`STRAIGHT_MM`) becomes straight and lies along its beam (`NEAR_BEAM`); an axis that hardly moves is at rest;
     step diagonals stay as they are. Positions of a ball-bar run move onto the sphere of the nominal length, from which rounding, chords and
-    block means differ by at most `BAR_TRAVEL_MM`. Off the sphere, a common scale would differ from the bar's length in the eighth digit,
-    and the rank would count it.
+    block means differ by at most `BAR_TRAVEL_MM`. Off the sphere, a common scale and the bar's length would differ in the eighth digit,
+    and the rank would count that difference.
     """
     if run.kind == "bar":
         return replace(run, axes_mm=_resting(_on_the_sphere(run)))
@@ -315,7 +315,7 @@ class MotionStatus:
 
 
 def status_of(share: float, *, hidden: bool) -> Status:
-    """Status for a share of information from the readings."""
+    """Return the status of a parameter; ``share``: part of its information that the readings give, 0 to 1; the prior gives the rest."""
     if hidden or share < WEAKLY_OBSERVED:
         return "not observable"
     return "observed" if share >= OBSERVED else "weak"

@@ -114,7 +114,7 @@ class ArtefactTest(TestRecipe):
             near = int(np.argmin(free))
             if free[near] < self.search_mm:
                 raise ConfigError(
-                    f"artefact {self.artefact}, feature {one.feature}: on the way beside it the stylus comes within {free[near]:.1f} mm of "
+                    f"artefact {self.artefact}, feature {one.feature}: on its way to it the stylus comes within {free[near]:.1f} mm of "
                     f"{balls[near].feature}",
                     "use a smaller stylus or a smaller search_mm, or leave a feature out",
                 )

@@ -71,7 +71,7 @@ SCRIPT_KEYS = (
 
 
 def add_live_page(app: FastAPI, context: PageContext, jobs: Callable[[], Sequence[JobState]] = tuple) -> None:
-    """Add the screen of the running measurement. ``jobs``: jobs since the start of the service, newest first; it shows the last outcome."""
+    """Add the screen of the running measurement and of the last outcome. ``jobs``: jobs since the service started, newest first."""
 
     @app.get("/live", include_in_schema=False)
     @needs(Permission.READ)

@@ -110,7 +110,7 @@ def test_lost_start_is_aligned_by_the_end(store: Store, campaign_id: int) -> Non
 @pytest.mark.parametrize(
     ("samples", "end", "message"),
     [
-        (stream(duration_us=900_000), END, "feed changed during the run, or its ends were lost"),
+        (stream(duration_us=900_000), END, "feed changed during the run, or its first or last samples were lost"),
         (
             stream(duration_us=2 * PATH_US),
             {"path_start_us": 0, "path_end_us": 2 * PATH_US},
