@@ -165,7 +165,7 @@ class ProbeState:
 class Latch:
     """Axis position at which the probe tripped, and when, microseconds of the controller's clock.
 
-    ``period_s``: how often the control looks at the probe; the trip was up to so much earlier. 0: the probe latches by itself.
+    ``period_s``: period at which the control looks at the probe; the trip was up to one period earlier. 0: the probe latches by itself.
     """
 
     position_mm: Point
@@ -228,7 +228,7 @@ class BallBar(Protocol):
 class DisplacementMeter(Protocol):
     """A laser Doppler displacement meter, or any other; positive: the target moves away from the instrument.
 
-    Every call ends in its own time-out. A driver makes a lost connection anew with the next call; its zero may be lost then.
+    Every call ends in its own time-out. After a lost connection the driver connects again with the next call; the zero may be lost then.
     """
 
     async def identify(self) -> DeviceInfo:
@@ -238,7 +238,7 @@ class DisplacementMeter(Protocol):
         """Make the present position 0. Raises DeviceFault where the device gives no valid reading."""
 
     async def clear_beam(self) -> None:
-        """Clear the mark of a lost beam, if the device keeps one; a new zero is due then."""
+        """Clear the mark of a lost beam, if the device keeps one. It must be zeroed again afterwards."""
 
     async def set_environment_compensation(self, on: bool) -> None:
         """Have the device correct its wavelength for the air, or not; a device without such a correction does nothing."""
@@ -321,7 +321,8 @@ class OneBank(Protocol):
     """A control with one table, which acts while its compensation is on. The table is an image (`abbe.drivers.tables`).
 
     ``write_table``: Refused while the table acts. ``switch``: numbered, so that a late or repeated request does nothing; Refused if the
-    CRC-32 of the control's image is not ``expect_crc``, or if it is switched so already. Compensation that is off stays off over a restart.
+    CRC-32 of the control's image is not ``expect_crc``, or if compensation is in that state already. Compensation that is off stays off
+    after a restart.
     """
 
     async def status(self) -> ControllerStatus: ...

@@ -115,8 +115,8 @@ class Flag(DeviceTable):
 class Command(DeviceTable):
     """A command, sent once and never repeated, and how the device acknowledges it.
 
-    Modbus: ``write`` goes to ``address`` on; with ``numbered`` a number goes before it, one more than that register holds, and the register
-    takes this number when the command is executed. ``becomes``: content of register ``acknowledge`` afterwards. Line: ``send``, and the
+    Modbus: the words ``write`` go to registers from ``address`` on. ``numbered``: register with the number of the last executed command;
+    the next number is then sent before ``write``. ``becomes``: content of register ``acknowledge`` afterwards. Line: ``send``, and the
     pattern of the ``answer``.
     """
 

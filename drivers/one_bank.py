@@ -2,12 +2,13 @@
 
 The table that acts is bank "active"; the other bank is memory of this process, where a new table is staged and read back while the old one
 acts. `OneBankTables.activate` switches compensation off, writes the table, reads it back in full and switches compensation on again. The
-control itself refuses writes while its table acts, and a switch when its table has not the expected CRC. So a mixture of two tables never
-acts: in between, nothing does. Whatever interrupts this leaves compensation off; the push machine then restores the old table from its
-journal. A crash loses the staged table and the lease, which are of this process.
+control itself refuses writes while its table acts, and refuses to switch on a table without the expected CRC. So a mixture of two tables
+never acts. An interruption leaves compensation off; the push machine then restores the old table from its journal. A crash loses the staged
+table and the lease: they exist only in this process.
 
-Weaker than two banks (docs/how-to/correct.md): nothing acts while tables are exchanged; interlocks are looked at before each switch, not by
-the control at that instant; there is no lease, so no other program may write tables; content of unknown origin is left to a person.
+Weaker than two banks (docs/how-to/correct.md): no table acts during the exchange; Abbe checks the interlocks before each switch, but the
+control does not check them at that instant; there is no lease, so no other program may write tables; if the origin of the content is
+unknown, a person must decide.
 """
 
 from __future__ import annotations

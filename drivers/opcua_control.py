@@ -4,11 +4,12 @@ A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the ex
 
     opc.tcp://192.168.0.40:4840/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ&moving=ns%3D2%3Bs%3DMoving&unit=mm
 
-``moving`` (a Boolean; optional) tells a standstill. The unit is that of the nodes' EngineeringUnits (UNECE code); ``unit`` (mm, um, m, in)
-states it where they have none, and is refused where they contradict it. A value whose quality is not good is refused.
+``moving`` (a Boolean node; optional) shows whether an axis moves. The unit is that of the nodes' EngineeringUnits (UNECE code); ``unit``
+(mm, um, m, in) states it for nodes without one, and must not contradict them. A value whose quality is not good is refused.
 
-Without more the session is anonymous and not encrypted: for a network of the machine's own. ``certificate``, ``key`` (PEM, ours) and
-``server`` (the server's, DER or PEM) encrypt it by Basic256Sha256, and no other server is spoken to; ``user`` and ``password_file`` log in.
+By default the session is anonymous and not encrypted: use that only in a network of the machine's own. ``certificate``, ``key`` (PEM,
+Abbe's) and ``server`` (the server's certificate, DER or PEM) encrypt it by Basic256Sha256; no other server is then accepted. ``user`` and
+``password_file`` log in.
 """
 
 from __future__ import annotations

@@ -66,7 +66,7 @@ def helix_figure(run: RunData) -> VerificationFigure:
 
 
 def same_pose(a: RunData, b: RunData) -> bool:
-    """Whether the artefact lay alike in two runs, within `SAME_MM`: turned alike, its touched points about the same place."""
+    """Whether the artefact had the same pose in two runs, within `SAME_MM`: same orientation, touched points around the same place."""
     p, q = a.points, b.points
     if p is None or q is None or q.source == "length" or p.artefact != q.artefact or not np.allclose(p.matrix, q.matrix, atol=1e-3):
         return False
@@ -78,7 +78,7 @@ def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = Fals
     """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
 
     ``with_machine``: the residual of the machine's solution in place of the whole deviation. Without a calibrated length the common
-    scale is fitted, too. Noise and uncertainty of the form, which add to the squares, are taken out of the rms; its uncertainty is theirs.
+    scale is fitted, too. Noise and uncertainty of the form enlarge the rms: they are subtracted in squares, and give its uncertainty.
     """
     p = run.points
     assert p is not None

@@ -126,7 +126,7 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
 def key_lines(text: str) -> dict[str, int]:
     """Number of the line, from 1, on which each key of a TOML text begins.
 
-    The beginning of a text up to a line is TOML if and only if no value is open at its end, so the library itself finds the lines.
+    A text cut after a line is valid TOML only if no value is open there, so the TOML library itself finds the lines.
     """
     found: dict[str, int] = {}
     lines, begun = text.split("\n"), 1

@@ -244,7 +244,7 @@ class MissedContact(ProbeFault):
 
 
 class Obstructed(ProbeFault):
-    """The probe tripped twice on a way where nothing should be: the artefact lies otherwise than stated."""
+    """The probe tripped twice on a way that should be free: the artefact is not in the stated pose."""
 
     code = "PRB-003"
 

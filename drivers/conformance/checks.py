@@ -48,7 +48,7 @@ class Move:
 
 
 async def identity(probe: DeviceUnderTest, file: DeviceFile | None) -> list[DeviceCheck]:
-    """Identify twice; what identifies the device is its registers, its answer, or nothing."""
+    """Identify twice: both answers must agree. Not proved if nothing in the device file identifies the device."""
     try:
         first, second = await probe.identify(), await probe.identify()
     except DriverError as error:

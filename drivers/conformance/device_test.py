@@ -1,7 +1,7 @@
 """The whole test of a device (`abbe device test`), and the abilities that follow from what it proved.
 
-Among other faults, replies come late, twice, spoilt or not at all, and the connection is cut: every reading is right or refused, and the
-readings go on.
+Among other faults, replies come late, twice, spoilt or not at all, and the connection is cut. Every reading must be right or refused, and
+the readings must continue.
 """
 
 from __future__ import annotations
@@ -157,7 +157,7 @@ MOTIONS = {"displacement": _METER, "laser": _METER, "ballbar": ("motion radius",
 
 @dataclass(frozen=True, slots=True)
 class Options:
-    """Options of a device test. ``role``: of a device with a driver, laser, ballbar or cnc; ``move``, ``ask``: None without a person."""
+    """Options of a device test. ``role``: laser, ballbar or cnc, for a device with a driver; ``move``, ``ask``: None if no person helps."""
 
     role: str = "laser"
     move: Move | None = None

@@ -71,7 +71,7 @@ async def watched(operation: str, call: Awaitable[T]) -> T:
 
 
 class WatchedProbe:
-    """Another probe, each call of which is `watched`."""
+    """Wraps another probe: each call of it is `watched`."""
 
     def __init__(self, probe: DeviceUnderTest) -> None:
         self._probe = probe

@@ -206,7 +206,7 @@ class StreamedLines(LineSource):
         """Number of lines that were not of the form of the device file."""
 
     async def identify(self) -> DeviceInfo:
-        """Wait for a line of the right form, which is all the identity that there is; errors as for `snapshot`."""
+        """Wait for a line of the right form: such a device has no other identity. Errors as for `snapshot`."""
         await self.snapshot()
         return self._info("")
 

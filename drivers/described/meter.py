@@ -30,10 +30,10 @@ ZEROED_MM = 0.05
 
 
 class DescribedMeter:
-    """A displacement sensor. Its zero is its own command, or the reading at that moment, which is then subtracted.
+    """A displacement sensor. `zero` sends the device's own command; without one, it subtracts the present reading from then on.
 
-    A reading is new if the device's counter or time stamp has changed. Without both, it is new if it was asked for ``update_s`` of the
-    device file later (registers), or because it answers a new request, or is a new line (lines of text).
+    A reading is new if the device's counter or time stamp has changed. A device with neither: a reading of registers is new ``update_s``
+    (device file) after the last new one; a line of text is always new.
     """
 
     def __init__(self, file: DeviceFile, source: DeviceSource) -> None:

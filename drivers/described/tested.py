@@ -16,7 +16,7 @@ FORMAT = "abbe-device-test/1"
 
 
 class Ability(StrEnum):
-    """Use of a device; the second needs more proofs.
+    """Use of a device. `DWELL` needs more proofs than `WATCH`.
 
     A device file never allows motion or tables, whatever its test proves: these need a driver, whose banks, read-back and
     compare-and-swap `abbe comp commission` proves.

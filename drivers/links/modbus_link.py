@@ -109,7 +109,7 @@ class Canary:
     """Registers with known content, which verify that replies come from this device and match their requests.
 
     ``words``: content from ``address`` on; ``readable``: most registers that one request may read from there. The number read varies,
-    because replies of different length cannot be confused. ``functions``: function codes that read these registers and all others alike.
+    because replies of different length cannot be confused. ``functions``: function codes that read any register with the same result.
     """
 
     address: int = 0

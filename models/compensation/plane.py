@@ -1,7 +1,7 @@
 """One-axis tables from a deviation that is known in a part of the strokes only: in planes at one or several heights, or in a box.
 
-The axes that span it correct each other in the directions that were sensed. Beyond the known part the tables hold their end values: there,
-and at other positions of an axis that no plane spans, they are assumed. A direction that was not sensed is not corrected.
+The axes that span it correct each other in the directions that were sensed. Beyond the known part the tables hold their end values. This is
+an assumption, as are the values at other positions of an axis that no plane spans. A direction that was not sensed is not corrected.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ def partial_tables(machine: Machine, boxes_mm: Sequence[F2], known: Known, count
     Parameters
     ----------
     boxes_mm : sequence of arrays, shape (3, 2)
-        Parts of the strokes in which the deviation is known, each but for a rigid motion of its own. Planes have an extent of zero along
-        their third axis; all boxes are spanned by the same axes.
+        Parts of the strokes in which the deviation is known, except for one unknown rigid motion per part. Planes have an extent of zero
+        along their third axis; all boxes are spanned by the same axes.
     known : function
         `Known`; rigid motion removed over the points that it is asked for.
     counts : (int, int, int)

@@ -59,7 +59,7 @@ class NamedEffect:
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
     needed : rms of the holdout runs without this effect over the rms with it; 1 or less: not needed. None: no holdout run, or a variance
         effect, which changes no mean reading.
-    sensor_doubt : why the temperature column of the warming part is probably another's; empty without doubt.
+    sensor_doubt : why the temperature column of the warming part probably belongs to another part; empty without doubt.
     """
 
     name: str
@@ -162,7 +162,7 @@ class Discovery:
     confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
-    alone : the result without any effect, if chance also gives names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
+    alone : the result without any effect; given if chance may also give names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
     left_out : gap of the fitted runs on blocks that are left out in turn (`abbe.models.discovery.left_out`); None if holdout runs judge.
     residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
     predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.

@@ -119,11 +119,11 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 
 
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Return the matrix that maps all coefficients of a pick to those of the effect without forms whose signal is nearest (least squares).
+    """Return the matrix from the coefficients of a pick, forms included, to coefficients of the plain effect with the nearest signal.
 
-    Shape (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's size count: an amplitude that
-    changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or wind-up, are no part of the
-    strength. ``offset``: fit the start value of a sensor as well, so that it does not change the strength.
+    Nearest: by least squares. Shape (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's size
+    count: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or
+    wind-up, are no part of the strength. ``offset``: fit the start value of a sensor as well, so that it does not change the strength.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]

@@ -189,7 +189,8 @@ def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, le
 def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str], turns: F1, resolution_mm: Mapping[str, float]) -> F1:
     """Weights, shape (n,): 0 for single readings far from their neighbours (`LONE`; a beam cut or a cup bumped for a moment), else 1.
 
-    Ball-bar readings off in a row count (`CROWD`), and those beside a reversal (``turns``, 1 there) unless others are off as often.
+    Ball-bar readings keep weight 1 if many near each other are off (`CROWD`), or if they lie beside a reversal (``turns`` is 1 there) and
+    readings elsewhere are off less often.
     """
     out = np.ones(residual.size)
     start = 0

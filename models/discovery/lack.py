@@ -49,9 +49,10 @@ class Floor:
 
 
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
-    """Noise of each instrument: from repeats, or from differences of neighbours if clearly below the residuals (these hold model errors).
+    """Return the noise of each instrument, from repeats or from differences of neighbouring readings, the smaller of both.
 
-    No effect enters these two, so the share of a gap that they judge is independent of effects.
+    Residuals also contain model errors; they count only if these two are not clearly smaller. Neither of the two contains an effect, so the
+    closed share of a gap does not depend on the effects found.
     """
     left = problem.projection.residual * problem.sd_mm()
     near = fine(left, problem.lengths, problem.kinds, problem.use, problem.projection.leverage)

@@ -131,8 +131,9 @@ def form_price(logs: float) -> float:
 
 @dataclass(frozen=True)
 class Contest:
-    """The search over one problem: banks of candidates, ``logs`` of `price` by label (``widths``), number of labels and of readings.
+    """The search over one problem: its banks of candidates, and the numbers of labels and readings.
 
+    ``widths``: argument ``logs`` of `price`, by label.
     ``seconds``: effects that are tried only beside another one (`abbe.models.effects.effect.Effect.beside`).
     """
 
@@ -320,7 +321,7 @@ def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def near_waves(second: Pick, first: Pick) -> bool:
-    """Whether ``second`` is a second wave beside ``first``, on the same axis, at a pitch too near to be another one."""
+    """Whether ``second`` is a wave on the same axis as ``first`` whose pitch is too near to count as another wave."""
     if first.effect.name not in second.effect.beside or second.key != first.key or "pitch_mm" not in second.values:
         return False
     return abs(first.values["pitch_mm"] / second.values["pitch_mm"] - 1.0) < 2.0 * APART
@@ -340,9 +341,9 @@ def weighed(contest: Contest, picks: Sequence[Pick]) -> list[Selection]:
 
 
 def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
-    """Standard uncertainty, s, of the moment at which pick ``i`` begins: a quarter of the times that explain nearly as much (`UNSURE`).
+    """Standard uncertainty, s, of the moment at which pick ``i`` begins: a quarter of the span of moments that explain nearly as much.
 
-    A step in time has no derivative, so the fit gives no uncertainty.
+    `UNSURE`: largest loss of gain that counts as nearly as much. A step in time has no derivative, so the fit gives no uncertainty.
     """
     rows, pick = others(problem, picks, i), picks[i]
     times = np.array([*moments(problem.paths), pick.values["t0_s"]])

@@ -298,7 +298,7 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]], *, memory: bool = False) -> WhitenedProblem:
     """Estimate the noise of a problem again beside the effects ``found`` (raw columns, prior sd), and exclude single outliers.
 
-    ``memory``: also estimate how much it remembers (`remembered`); before a search this would take effects for noise.
+    ``memory``: also estimate the autocorrelation of the noise (`remembered`). Only after a search: before it, effects would count as noise.
     """
     for k in range(ROUNDS):
         problem = with_projection(problem)

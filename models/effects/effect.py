@@ -91,7 +91,7 @@ class Effect:
     variant_of : str
         Name of a simpler effect which this one contains. It replaces the simpler one only on clear evidence.
     beside : tuple of str
-        Names of the effects beside which alone this one is tried, at the same key.
+        Names of effects. This one is tried only if one of them was found at the same key; empty: always.
     separated_by : dict
         Maps a rival (name, or name:key) to the tests that separate the two (``next_test.adds``).
     """

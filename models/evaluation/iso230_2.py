@@ -52,9 +52,9 @@ class Approaches:
 class ScaleBudget:
     """Standard uncertainties that the repeats do not show.
 
-    ``slope``: of a slope of all deviations, mm per mm (wavelength, temperature and expansion of the scales): each figure is evaluated again
-    with the deviations tilted by it, so that a flat axis, too, is not known better than its slope. ``reading_mm``: of the mean at each
-    position, independent from position to position (resolution, drift of the environment).
+    ``slope``: uncertainty of a common slope of all deviations, mm per mm (wavelength, temperature and expansion of the scales). Each figure
+    is evaluated again with the deviations tilted by it, so that a flat axis has this uncertainty, too. ``reading_mm``: uncertainty of the
+    mean at each position, independent from position to position (resolution, drift of the environment).
     """
 
     slope: float = 0.0

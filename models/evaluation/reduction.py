@@ -6,9 +6,10 @@ Uncertainty as in ISO/TR 16015: temperature and coefficients are independent con
 
 Convention. Displacements and deviations grow with the axis coordinate; deviation = displacement read - displacement commanded. At t °C a
 scale of coefficient a moves the axis by (1 + a (t - 20)) for each commanded mm. A laser reads true length, so its coefficient is 0. If its
-own compensation of material expansion is on, it has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L what its own
-sensor of material temperature read. Scale at T, stated t = T + e and t_L = T + e_L: measured was a (T - 20) - b (T + e_L - 20), taken off
-is (a - b) (T + e - 20), and -(a - b) e - b e_L is left. The errors e and e_L are independent and have the same u(t).
+own compensation of material expansion is on, it has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L the reading of
+its own sensor of material temperature. Let the scale be at T, t = T + e and t_L = T + e_L. The measurement contains a (T - 20) -
+b (T + e_L - 20), the correction removes (a - b) (T + e - 20), and -(a - b) e - b e_L remains. The errors e and e_L are independent and
+have the same u(t).
 
 A workpiece of coefficient w is as warm as the scale when it is made, and shrinks when it cools down: for dimensions at 20 °C of such parts,
 w (t - 20) is taken off in place of a (t - 20). Along a diagonal every axis counts with the square of its share of the direction.

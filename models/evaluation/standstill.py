@@ -16,10 +16,11 @@ COVERED = 0.95
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Every run predicted from all the others; the rms over each run counts alike, mm.
+    """Every run predicted from all the others. Each rms, mm, is over all runs, and each run has the same weight.
 
-    ``predicted_mm``, ``u_mm``: by run, (n,) each; ``raw_mm``: of the displacements; ``static_mm``: after changes of temperature at once
-    (least squares); ``response_mm``; ``covered``: share of readings within U (k = 2), widened as all other runs need it.
+    ``predicted_mm``, ``u_mm``: by run, (n,) each. ``raw_mm``: rms of the displacements; ``static_mm``: rms that a model without lag leaves
+    (least squares); ``response_mm``: rms that the response leaves. ``covered``: share of readings within U (k = 2); U is widened by the
+    factor that all other runs need.
     """
 
     predicted_mm: tuple[F1, ...]

@@ -209,7 +209,7 @@ class Series:
         return Fit(self.since_start, tau_s, noise, evidence - float(self._blocks[rows].sum() * np.log(scatter)), mean, covariance)
 
     def best(self, kept: Sequence[int], shift: Shift | None, tau_s: float, start: Grid) -> Fit:
-        """The fit with the noise of largest evidence, climbed from ``start`` step by step."""
+        """Return the fit whose noise has the largest evidence; the search climbs from ``start`` step by step."""
         found, better = self.fit(kept, shift, tau_s, start), True
         while better:
             better = False

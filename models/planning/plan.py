@@ -155,7 +155,7 @@ def plan_campaign(
     goal_mm : float, optional
         Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it ends with the step that does.
     vertical : int
-        Index of the vertical axis: hemispheres open along it if the tool does not show the side of the spindle.
+        Index of the vertical axis. Hemispheres open upwards along it if the tool vector does not show where the spindle is.
     progress : callable
         Called with the share that is done, 0 to 1.
 

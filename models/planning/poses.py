@@ -1,7 +1,7 @@
-"""Uncertainty that poses of a probed artefact leave in their plane of the machine: the posterior bound, with a free form of the artefact.
+"""Uncertainty of a plane of the machine after an artefact of unknown form was probed there in several poses: the posterior bound.
 
-Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share unknowns, the form of the artefact, so all of them
-count at once.
+Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share unknowns, the form of the artefact. So all poses are
+evaluated together.
 """
 
 from __future__ import annotations

@@ -34,8 +34,8 @@ SEARCH_VALUES = 120
 class PlanningProblem:
     """Machine, instruments and priors of a plan, and the unknowns that all mountings share.
 
-    ``root``, shape (size, size): these unknowns, mm or rad, are ``root`` @ independent ones of prior variance 1, by the prior that a
-    solution starts from (`abbe.models.solvers.priors.size_model`).
+    ``root``, shape (size, size): factor of their prior covariance; unknowns (mm, rad) = ``root`` @ independent unknowns of variance 1. The
+    prior is that from which a solution starts (`abbe.models.solvers.priors.size_model`).
     """
 
     machine: Machine

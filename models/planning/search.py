@@ -217,9 +217,9 @@ class PlanSearch:
         return chosen
 
     def judge(self, chosen: Chosen, budget_min: float) -> Measurement | None:
-        """The holdout run of a plan: at a mounting of the plan, so that only the machine can make it deviate.
+        """Return the holdout run of a plan. It uses a mounting of the plan, so that only the machine can make it deviate.
 
-        The longest bar the other way round, else another step order of a diagonal; None: none fits into what the plan leaves of the
+        It takes the longest bar in the other direction, else another step order of a diagonal. None: no such run fits into the rest of the
         minutes, and into `JUDGE_SHARE` of them.
         """
         most = min(budget_min - self.total_min(chosen), JUDGE_SHARE * budget_min)

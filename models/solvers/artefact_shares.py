@@ -1,7 +1,7 @@
-"""Errors that move with an artefact and errors of the machine: the named fields of a plane, in each of the two, with U and evidence.
+"""Split of the named error fields of a plane into errors of an artefact and errors of the machine, with U and evidence.
 
-The form of the artefact and the map of the machine are unknowns of one solution; the poses tell them apart, or not. A field that the poses
-hide (`abbe.models.solvers.observability.poses`) is unknown if it is there at all: its split would be that of the priors.
+The form of the artefact and the map of the machine are unknowns of one solution, and only the poses separate them. If the poses hide a
+field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors.
 
 Evidence: log of the Savage-Dickey ratio of a normal prior and posterior at zero, nats (Dickey 1971).
 """
@@ -134,7 +134,7 @@ def _weights(q: F2) -> F2:
 
 
 def form_amounts(p: ArtefactPoints, places: dict[str, F1], names: tuple[str, ...]) -> F2:
-    """Return weights by which the unknowns of an artefact's form make the named fields, mm at its farthest feature, shape (5, unknowns)."""
+    """Return the matrix from the unknowns of an artefact's form to the named fields, mm at its farthest feature, shape (5, unknowns)."""
     nominal = np.array(list(places.values()))
     q = (nominal - p.middle_mm)[:, :2] / p.reach_mm
     return _weights(q) @ form_rows(p, tuple(places), nominal, names)[:, :2].reshape(2 * len(q), -1)

@@ -334,7 +334,7 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
     It differs in two ways, none of which matters with many readings.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
-      that the readings hardly separate, the most probable sizes are too small. Ignorance alone makes it at most the documented one.
+      that the readings hardly separate, the most probable sizes are too small. Without information it is at most the documented one.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("smoothness ") for name in model.names])

@@ -259,7 +259,7 @@ def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Gr
 def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:
     """Score for further terms whose variance the fit takes as zero, in standard deviations of the score without them.
 
-    Positive if the residuals are more alike where these terms are alike than noise would be: the derivative of the log evidence by the
+    Positive if residuals are more alike than noise at readings where these terms are alike: the derivative of the log evidence by the
     variance of ``terms`` (their prior: `size_model`), over the root of its expected information (Rao's score test).
     """
     sizes = size_model(problem.machine, terms, (), np.zeros(0), Priors())

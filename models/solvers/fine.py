@@ -3,8 +3,8 @@
 Polynomials are too smooth for it, and an artefact has too few points to sample it. Errors that change from position to position get one
 unknown per position of an axis (`abbe.models.solvers.artefact.Fine`); at other positions they count as uncertainty. Periods are searched by
 the score of a sine and cosine, on each axis and on all axes together (screws of one lead). Every probable period enters the model with a
-size weighted by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases). A period
-found first is searched again beside the others, because an alias may fit best while they are still in the scatter.
+size weighted by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases). The first
+period is searched again once the others are in the model, because an alias may fit best while the others still add to the scatter.
 """
 
 from __future__ import annotations
@@ -69,7 +69,7 @@ class Score:
         return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
 
     def gain(self, columns: F2, size: float) -> tuple[float, float]:
-        """Sum of squares that unknowns of this prior standard deviation explain, and log of how much of their prior they use up."""
+        """Sum of squares that unknowns of this prior standard deviation explain, and log ratio of their prior to posterior volume."""
         asked, information = self.asked(columns)
         whole = np.eye(len(asked)) + size**2 * information
         return float(size**2 * asked @ np.linalg.solve(whole, asked)), float(0.5 * np.linalg.slogdet(whole)[1])

@@ -204,8 +204,8 @@ def chosen_order(solution: JointSolution) -> int:
 def omitted_terms(terms: tuple[Term, ...], orders_above: int) -> tuple[Term, ...]:
     """Terms of the ``orders_above`` Legendre orders above the highest one of each error motion, or of the model if it lacks the motion.
 
-    None above a rough part: inside the stroke the next four orders would add 6 % to its variance, but at the ends, where every Legendre
-    polynomial is 1 and its own orders already hold twice their size elsewhere, as much again.
+    A motion with a rough part gets none. Inside the stroke the next four orders would add 6 % to its variance. But at the ends, where every
+    Legendre polynomial is 1 and its own orders are already twice as large as elsewhere, they would double it.
     """
     order = {t.motion: t.order for t in sorted(terms, key=lambda t: t.order) if t.order}
     model = max((v for v in order.values() if v <= SMOOTH_ORDER), default=0)

@@ -43,7 +43,7 @@ def key_name(key: bytes) -> str:
 
 
 def mac_of(key: bytes, digest: str) -> str:
-    """Return the seal of a digest: nobody can forge it without the key."""
+    """Return the seal of a digest. It cannot be forged without the key."""
     return hmac.new(key, digest.encode(), hashlib.sha256).hexdigest()
 
 

@@ -1,6 +1,6 @@
 """A database in pieces, each a file named by its SHA-256: backups in one folder share equal pieces as hard links.
 
-Every backup is complete: whoever deletes one takes only the pieces that no other backup holds.
+Every backup is complete: deleting one removes only the pieces that no other backup holds.
 """
 
 from __future__ import annotations

@@ -39,7 +39,7 @@ class Campaign:
 
     @property
     def head(self) -> CampaignHead:
-        """Facts known at its begin. Raises Unusable if a field has another type."""
+        """Facts known when the campaign began. Raises Unusable if a field has another type."""
         return record(CampaignHead, self.doc, f"campaign {self.name}")
 
     def without(self, labels: list[str]) -> Campaign:

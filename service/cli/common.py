@@ -265,7 +265,7 @@ def first_sentence(text: str) -> str:
 
 
 def give_form(app: typer.Typer) -> None:
-    """Give help, ``--out`` and their order to every command of a tree."""
+    """Give every command of a tree its sorted help and the option ``--out``."""
     app.info.cls = GroupedHelp
     for group in app.registered_groups:
         group.cls = GroupedHelp
@@ -293,7 +293,7 @@ def _with_out(work: Any) -> Any:
 
 @contextmanager
 def answer_into(out: Path | None) -> Iterator[None]:
-    """Collect what is written to stdout, and write it to a file when the work has ended with an answer; None: leave it alone."""
+    """Collect the text written to stdout, and write it to the file ``out`` when the work has ended with an answer; None: do nothing."""
     if out is None:
         yield
         return

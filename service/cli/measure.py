@@ -174,7 +174,10 @@ def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
 
 @dataclass(frozen=True, slots=True)
 class ConsoleOptions:
-    """Statements of the person by options: ``resume`` a campaign; the set-up is ``untouched``; the unknown table in force is right."""
+    """Options of the person at the console.
+
+    ``resume``: continue a campaign; ``untouched``: the set-up was not touched; ``accept_table``: the unknown table in force is right.
+    """
 
     resume: bool
     untouched: bool

@@ -54,7 +54,7 @@ class Exported:
 
 
 def scales_badly_known(doc: dict[str, Any]) -> Scales | None:
-    """The scales that are the largest part of a stored solution's uncertainty; None if none are."""
+    """The scales, if they are the largest part of a stored solution's uncertainty; None if another source is larger."""
     found = ((doc.get("uncertainty") or {}).get("without_scale") or {}).get("scales")
     return found if found in SCALE_TEXTS else None
 

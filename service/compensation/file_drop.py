@@ -2,8 +2,8 @@
 
 Beside the exported files ``OUT`` a folder ``OUT.dropped`` holds ``receipt.json`` (`abbe-drop/1`) and ``before/``, the files that lay in the
 control's folder. The receipt is on disk before the first file is written, so an interrupted drop can be taken back. A person loads the
-files at the control. A drop is confirmed when the control has written its tables into files again and these hold the same corrections; what
-a person says to have seen is recorded as that, and is not a confirmation.
+files at the control. A drop is confirmed when the control has written its tables into files again and these hold the same corrections; a
+person's statement is recorded, but is no confirmation.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class OpcUaPlace:
         self.name = url
 
     def get(self, name: str) -> bytes | None:
-        """Return a file's content; a file without any counts as not there."""
+        """Return a file's content; None if the file is empty or missing."""
         return asyncio.run(self._do(name, None)) or None
 
     def put(self, name: str, content: bytes | None) -> None:

@@ -52,7 +52,7 @@ class Board:
             self.job = replace(self.job, **{field.name: getattr(progress, field.name) for field in fields(Progress)})
 
     def job_ended(self, doc: Doc | None) -> None:
-        """Note how the check ended. A stopped or failed check changes the state of no device but the one that caused its end."""
+        """Note how the check ended. A stopped or failed check changes only the state of the device that caused its end."""
         self.changes += 1
         self.job = None
         cause = doc["cause"] if doc is not None else None

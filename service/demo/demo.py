@@ -81,13 +81,13 @@ class DemoResult(DemoRun):
 
     @property
     def corrected(self) -> Correction:
-        """The correction; AssertionError before it."""
+        """The correction. Raises AssertionError if there is none yet."""
         assert self.correction is not None
         return self.correction
 
     @property
     def truths(self) -> tuple[SealedTruth, SealedTruth]:
-        """The sealed truth before and after; AssertionError before the end."""
+        """The sealed truth before and after. Raises AssertionError if the demonstration has not ended."""
         assert self.truth_before is not None
         assert self.truth_after is not None
         return self.truth_before, self.truth_after

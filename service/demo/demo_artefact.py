@@ -1,7 +1,7 @@
 """The demonstration of a touch probe and a plate: a simulated machine maps and corrects itself in the plane where the plate lay.
 
 measure in four poses -> measure a fifth one (before) -> solve -> tables of this plane -> push -> the fifth pose again (after) -> keep
-or roll back; then the sealed truth of the simulator. Nobody knows the plate beyond one length. The ball-bar only proves sign and unit of
+or roll back; then the sealed truth of the simulator. Only one length of the plate is known. The ball-bar only proves sign and unit of
 the tables (`abbe comp commission`), the laser only measures the temperature.
 """
 

@@ -1,6 +1,6 @@
 """Locks a machine, and opens and closes all its devices together: nothing stays open when one of them fails.
 
-Only one process at a time may use a machine: of two, each would move a mounted bar that the other believes elsewhere. The process that uses
+Only one process at a time may use a machine: a second one would move a mounted bar without knowledge of the first. The process that uses
 the machine locks a file in a folder shared by all accounts of this computer, including a systemd service with private processes and a
 private ``/tmp``.
 

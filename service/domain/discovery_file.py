@@ -28,8 +28,8 @@ Adds = Literal[
 class FoundEffect(FileObject):
     """One named effect. ``parameters``: ``strength`` and its standard uncertainty ``u_strength`` in the effect's unit, and further ones.
 
-    ``proved``: whether runs that were never fitted confirm the effect. ``sensor_doubt``: why the temperature column of the warming part is
-    probably another's.
+    ``proved``: whether runs that were never fitted confirm the effect. ``sensor_doubt``: why the temperature column of the warming part
+    probably belongs to another part.
     """
 
     name: str

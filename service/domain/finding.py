@@ -152,7 +152,7 @@ class EffectFound(EffectSize):
     """An effect of a finding.
 
     ``proved``: whether runs that were never fitted confirm it; None: not judged. ``sensor_doubt``: why the temperature column of the
-    warming part is probably another's; empty without doubt.
+    warming part probably belongs to another part; empty without doubt.
     """
 
     alternatives: tuple[RivalEffect, ...] = ()

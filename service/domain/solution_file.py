@@ -14,7 +14,7 @@ Digest = str
 
 
 class Versions(FileObject):
-    """Which program solved it."""
+    """Versions of the programs that solved it."""
 
     abbe: str
     numpy: str

@@ -12,7 +12,7 @@ Model = Literal["absolute", "since_start"]
 
 
 class StandstillRms(FileObject):
-    """Rms over all runs, µm, each run predicted from all others: nothing explained, temperatures at once, lagged response."""
+    """Rms residual over all runs, µm, each run predicted from all others: without a model, with a model without lag, with lag."""
 
     raw: float = Field(ge=0)
     static: float = Field(ge=0)

@@ -1,7 +1,7 @@
 """The 10 µm step of a format for one machine: tables that move one axis at one place, and the expected reading there.
 
-It proves sign, axis, unit and scale of a control before the first real table. All else is zero. A format without tables of one axis gets
-the smallest of what it holds: an error motion, a node of a grid, a straight line, or lost motion.
+It proves sign, axis, unit and scale of a control before the first real table. All else is zero. A format without one-axis tables
+gets the smallest part that it can hold: an error motion, a node of a grid, a straight line, or lost motion.
 """
 
 from __future__ import annotations

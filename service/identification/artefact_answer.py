@@ -73,8 +73,10 @@ def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2,
 
 
 def touched_boxes_mm(joint: JointSolution) -> tuple[F2, ...]:
-    """Return the lowest and highest position of each axis over all points, mm, shape (3, 2): one box, or, where the direction of an axis
-    was not sensed, one for each of its positions, at which that axis stands."""
+    """Return boxes around all points, mm, shape (3, 2) each: lowest and highest position of each axis.
+
+    One box; if the direction of an axis was not sensed, one box for each position of that axis.
+    """
     places = np.concatenate([run.axes_mm for run in joint.data if run.points is not None and run.points.source != "length"])
     box, axis = np.stack([places.min(axis=0), places.max(axis=0)], axis=1), unsensed_axis(joint)
     if axis is None:

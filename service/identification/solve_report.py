@@ -136,8 +136,8 @@ LISTED = 20
 class Assessment:
     """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed.
 
-    ``scale_free``: the same without those scales that are the largest part of the uncertainty, for tables of all the rest; None if none
-    are. ``left_out``: the scales that are left out of ``sources`` and its results; ``joint`` still has them.
+    ``scale_free``: the same without the scales, for tables of all the rest; None if scales are not the largest part of the uncertainty.
+    ``left_out``: the scales that are left out of ``sources`` and its results; ``joint`` still has them.
     """
 
     solved: Solved

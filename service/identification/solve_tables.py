@@ -87,8 +87,8 @@ def scale_free(found: Assessment) -> Assessment:
 def deviation_text(found: Assessment, points_mm: F2) -> str:
     """Return the deviation at points, shape (n, 3), as CSV with a line for each point, and the verdict of the solution as a last comment.
 
-    ``dx_um`` to ``dz_um``: tool relative to workpiece, best-fit rigid motion over the strokes removed (of artefacts: as a comment says, and
-    empty in a direction that was not sensed); ``U_``: expanded uncertainty, 95 %.
+    ``dx_um`` to ``dz_um``: tool relative to workpiece, best-fit rigid motion over the strokes removed (for artefacts
+    a comment states the frame; a direction that was not sensed is empty); ``U_``: expanded uncertainty, 95 %.
     """
     notes = [f"# verdict: {solution_verdict(found).word}"]
     if found.joint.only_artefacts:

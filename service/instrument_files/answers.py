@@ -154,7 +154,7 @@ def unknown_of(test: AxisReadings) -> list[str]:
 
 
 def laser_of(tests: Sequence[AxisReadings]) -> dict[str, float]:
-    """The laser of these tests for the campaign: its resolution, and the uncertainties that the unknown widens; the worst test counts."""
+    """Return the laser of the worst of these tests: its resolution, and uncertainties that unknown facts have widened."""
     out = {"resolution_mm": max(test.resolution for test in tests)}
     if any(f"temp_{test.axis.lower()}_C" not in test.further for test in tests):
         out["u_scale_temperature_k"] = float(U_SCALE_TEMPERATURE_K)

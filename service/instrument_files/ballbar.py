@@ -1,4 +1,4 @@
-"""Renishaw .b5r: results of a ball-bar test, XML (one public reader). Where the trace is kept is in no public reader: it is not read."""
+"""Renishaw .b5r: results of a ball-bar test, XML (one public reader). No public reader shows where the trace is stored: it is not read."""
 
 from __future__ import annotations
 

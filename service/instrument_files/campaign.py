@@ -45,11 +45,11 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     contents : sequence of Content
         One for each file.
     answers : Answers
-        Counts for every file that leaves its question open.
+        Used for every file that does not answer the question itself.
     name : str
         Name of the campaign.
     machine : dict, optional
-        Machine object of a machine file. Without it, chain and strokes are assumed, which every origin says.
+        Machine object of a machine file. Without it, chain and strokes are assumed, and every origin states that.
 
     Raises
     ------

@@ -132,7 +132,7 @@ def _decoded(data: bytes) -> str:
 
 
 def step_of(words: list[str], unit: float) -> float:
-    """Smallest step of numbers that are printed so, in ``unit``: one in the last decimal of the longest; 0 for none."""
+    """Smallest step of printed numbers, in ``unit``: one in the last decimal of the longest number; 0 without numbers."""
     last = [_decimals(word) for word in words if NUMBER.fullmatch(word)]
     return unit * 10.0 ** -max(last) if last else 0.0
 

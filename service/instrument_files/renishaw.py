@@ -1,7 +1,7 @@
 """Renishaw .rtl and .rta: tests of positioning and of angle, as text in sections (two public readers, one public writer).
 
 Numbers are mm for targets; deviations are µm in .rtl and mrad in .rta. The runs of a test in both directions are read alternately along
-the targets and back. What is not known of the format is refused, not guessed.
+the targets and back. Unknown parts of the format are refused, not guessed.
 """
 
 from __future__ import annotations

@@ -65,7 +65,7 @@ class MessageSource(Protocol):
 
 
 class OutboxStore(Protocol):
-    """The part of the store that is used here."""
+    """The part of the store that the publisher needs."""
 
     def pending(self, limit: int = ...) -> Sequence[OutboxRow]:
         """Return the oldest unacknowledged messages."""

@@ -51,7 +51,7 @@ class OperationKind(Enum):
 class Operation:
     """One operation. Fields that a kind does not need keep their defaults.
 
-    ``first``, ``count``: registers; ``data``: bytes to write or to expect; ``mark``: this read opens a bracket of reads (`bracket`).
+    ``first``, ``count``: registers; ``data``: bytes to write or to expect; ``mark``: this LOOK opens a bracket of reads (`bracket`).
     """
 
     kind: OperationKind

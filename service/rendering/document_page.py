@@ -57,8 +57,8 @@ def document_html(document: Document) -> str:
 def document_pdf(document: Document) -> bytes:
     """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
 
-    Chinese, Japanese and Korean letters need a font of the computer. Without one for its language the report is English; it says so, and
-    so it does of names that it cannot print.
+    Chinese, Japanese and Korean letters need a font of the computer. Without such a font the report is in English and says
+    so; it also says which names it cannot print.
     """
     import typst
 

@@ -16,9 +16,9 @@ PLACES = {"laboratory": "in the laboratory", "customer": "at the customer's", "l
 
 
 def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
-    """Number, facts, statements and what is missing of a certificate; None without a laboratory or without a measurement.
+    """Return number, facts, statements and missing facts of a certificate; None without a laboratory or without a measurement.
 
-    ``digest``: SHA-256 of the report, of which the number is made: equal results have one number, other results another.
+    ``digest``: SHA-256 of the report. The number is made from it, so equal results have the same number.
     """
     issuer = document.issuer
     if issuer is None or document.kind not in OF_MEASUREMENTS:

@@ -1,7 +1,7 @@
 """Translate English sentences (stored verdicts and remarks, reports, pictures) to the reader's language.
 
-A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the braces is
-translated by the same rules. It never contains the end of a sentence; if its name has one letter, it contains no blanks. A phrase has no
+A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the braces
+is translated by the same rules. It never contains the end of a sentence; if its name has one letter, it contains no blanks. A phrase has no
 full stop at its end. A text without a pattern is split into sentences and their parts, and each part is tried; a part without a pattern
 stays English. Tests search all screens and reports for texts without a pattern.
 """

@@ -62,7 +62,7 @@ class Svg:
             self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="{_attr(style)}"{_close("rect", tip)}')
 
     def link(self, corner: XY, size: XY, href: str) -> None:
-        """Area over what is drawn that a script of the page leads on from; links for the keyboard stand beside the picture."""
+        """Invisible area whose click a script of the page turns into a link to ``href``; keyboard users find links beside the picture."""
         (x, y), (w, h) = _pair(corner), _pair(size)
         self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="leads" fill-opacity="0" data-href="{_attr(href)}"/>')
 

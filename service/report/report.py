@@ -46,7 +46,7 @@ NOT_JUDGED = "Not judged"
 def with_later_changes(document: Document, store: Store, machine: str, begun_utc: str, runs: Sequence[Run]) -> Document:
     """Return the report, with a note if its table is not in force now. The verdict says so, too.
 
-    ``begun_utc``: time of the measurement, or end of the push. ``runs``: of the report; empty: only the time counts.
+    ``begun_utc``: time of the measurement, or end of the push. ``runs``: runs of the report; without them only the time is compared.
     """
     known = verified_by(store, machine)
     if document.verdict is None or _same(known, begun_utc, runs):
@@ -297,7 +297,7 @@ def rules_of(config: MachineFile | None) -> Rules:
 
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:
     """The report as a certificate of the laboratory in the rules, if they name one; ``measured_on``: day of the measurement, if the
-    report does not know it; ``issued``: of the certificate."""
+    report does not know it; ``issued``: day of issue."""
     days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
     return replace(document, issuer=rules.issuer, item=rules.item, days=days, issued=issued.isoformat())
 

@@ -55,9 +55,9 @@ def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> f
 def touch_columns(records: Sequence[TouchRecord], start: RunStart, pose: ArtefactPose) -> Columns:
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
-    ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches over
-    the root of the touches, with the way between two looks of the control at the probe, alike in repeated touches. A ball's height,
-    from one side and the radius, is less certain (`abbe.service.runs.artefact_points.POLE`).
+    ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches
+    divided by the root of their number, and the way between two looks of the control at the probe, an error that repeated touches share.
+    A ball's height comes from one side and the radius, so it is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
     found = [found_feature(record) for record in records]
     deviation = [(f.centre_mm - pose.origin_mm) @ pose.matrix - np.array(r.nominal_mm) for f, r in zip(found, records, strict=True)]

@@ -135,7 +135,7 @@ class AlarmManager(RetryingStore):
             proposal, after = entry.facts.proposal or 0, entry.facts.after
             now = await asyncio.to_thread(self._of_proposal, proposal, after) or NOTHING_YET
             if entry.kind == AlarmKind.PUSHING or now.word != OPEN:
-                text = f"{now.text} (it was interrupted with the service)" if entry.kind == AlarmKind.PUSHING else now.text
+                text = f"{now.text} (it was interrupted when the service stopped)" if entry.kind == AlarmKind.PUSHING else now.text
                 await self._record_pushed(entry.alarm, proposal, after, JobOutcome(now.word, text))
                 changed = True
         return await asyncio.to_thread(self._store.alarms.entries, self._machine) if changed else entries

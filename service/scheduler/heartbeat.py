@@ -23,7 +23,7 @@ WAITING = "waiting"
 
 
 class HeartbeatSink(Protocol):
-    """The part of the store that is used here."""
+    """The part of the store that heartbeats need."""
 
     def put(self, machine: str, doc: Doc) -> None:
         """Write the current state of a machine's service."""

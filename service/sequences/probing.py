@@ -40,7 +40,7 @@ def need_probe(controller: object) -> Probing:
 
 
 async def guarded_move(controller: Motion, target: Point, *, feed_mm_min: float, timeout_s: float) -> None:
-    """Move; with a probe fitted as a touch command, because an abort may have left the stylus in a hole or beside a ball.
+    """Move. If a probe is fitted, move by a touch command: an abort may have left the stylus in a hole or beside a ball.
 
     Raises
     ------
@@ -68,7 +68,7 @@ async def guarded_move(controller: Motion, target: Point, *, feed_mm_min: float,
 
 @dataclass
 class FeatureTouch:
-    """One feature under the probe. ``asked``: whether to leave it before the next touch; ``false_trips``: trips that did not repeat."""
+    """One feature under the probe. ``asked``: returns whether a stop or pause is requested; ``false_trips``: trips that did not repeat."""
 
     probe: Probing
     step: TouchFeature

@@ -218,7 +218,7 @@ class JournalView:
         return self._last_own(lambda number, origin: number > after and origin.proposal == proposal, TableNames())
 
     def of_order(self, order: str) -> JobOutcome | None:
-        """Outcome of an ordered rollback; None if the journal has none, so that nothing was written."""
+        """Outcome of an ordered rollback; None if the journal does not contain it: nothing was written."""
         return self._last_own(lambda _, origin: origin.order == order, BACK)
 
     def _last_own(self, own: Callable[[int, TableOrigin], bool], names: TableNames) -> JobOutcome | None:

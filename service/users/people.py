@@ -233,7 +233,7 @@ class UserAccounts:
         return user
 
     def check_pin(self, name: str, pin: str) -> UserRecord | None:
-        """The user, if the PIN matches, the role may use one and the user is enabled; else None. Everybody takes the same time."""
+        """The user, if the PIN matches, the role may use one and the user is enabled; else None. The answer always takes the same time."""
         user = self._store.people.find(name) if NAME.fullmatch(name) else None
         right = self.passwords.verify(None if user is None else user.pin, pin)
         return user if right and user is not None and user.disabled_utc is None and Role(user.role) in PIN_ROLES else None

@@ -52,8 +52,9 @@ class ScaleTemperature:
 class Reduction:
     """Reduction of a test to 20 °C.
 
-    ``expansion``: None if it is not; ``workpiece``: of the workpieces, None without a coefficient; ``at``: temperature of the scales as
-    text; ``of_workpiece``: coefficient as text; ``text``: the values used, or why it is not reduced; ``notes``: on its temperature.
+    ``expansion``: of the scales, None if the test is not reduced; ``workpiece``: of the workpieces, None without a coefficient; ``at``:
+    temperature of the scales as text; ``of_workpiece``: coefficient as text; ``text``: the values used, or why the test is not reduced;
+    ``notes``: remarks on its temperature.
     """
 
     expansion: Strain | None

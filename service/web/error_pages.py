@@ -48,7 +48,7 @@ def for_people(request: Request) -> bool:
 class ErrorPages:
     """Shows a problem document to people as a screen: a browser's address bar never shows JSON, whichever layer refuses the request.
 
-    Pure ASGI, outside of everything that refuses. ``status``: source of the status bar.
+    Pure ASGI, around all layers that can refuse a request. ``status``: source of the status bar.
     """
 
     def __init__(self, app: ASGIApp, env: Environment, status: Callable[[], Awaitable[Status]]) -> None:

@@ -36,7 +36,7 @@ SCREENS = {
 
 
 def step_address(step: PathStep, to_do: bool = False) -> str:
-    """Address of a step; ``to_do``: of the task of the step. Empty: nothing exists yet."""
+    """Address of the result of a step, empty if there is none yet; with ``to_do``, of the screen on which a person does the step."""
     if to_do and step.key in {"cause", "proposal", "proof"}:
         return "/new?" + urlencode({"recipe": step.recipe or IDENTIFICATION})
     if step.number is None or (step.key == "report" and step.state != "now"):

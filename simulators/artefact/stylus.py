@@ -1,7 +1,7 @@
 """The touch probe: a ball on a stylus that trips a little after it touches, later in some directions than in others (lobing).
 
-Of a kinematic probe with three arms the pre-travel repeats every 120 degrees. The ball's first touch and the trip are apart by the
-pre-travel; the noise of the trip is the repeatability.
+The pre-travel is the way from the ball's first touch to the trip. In a kinematic probe with three arms it repeats every 120 degrees. The
+noise of the trip is the repeatability.
 """
 
 from dataclasses import dataclass

@@ -58,7 +58,7 @@ class PtyPort:
         return f"serial://{path}?baud={BAUD}"
 
     def room(self) -> int:
-        """Return the room in the buffer; none while unplugged."""
+        """Return how many bytes the buffer can still take; 0 while unplugged."""
         return 0 if self._serial is None else max(0, self._buffer_bytes - self._serial.backlog)
 
     @property

@@ -361,7 +361,8 @@ def _sized(
 def visibility(e: Hidden, perfect: PerfectMachine, runs: list[Run], model_projector: Projector) -> Visibility:
     """Return the visibility of an effect in runs to which the present model is fitted.
 
-    Of the part that the model cannot absorb, over the noise, ``snr_total`` is the norm, ``snr_local`` the rms where it is noticeable.
+    Both ratios concern the part that the model cannot absorb: ``snr_total`` is its norm, ``snr_local`` its rms where it is noticeable,
+    divided by the noise.
     """
     without, with_it = Rig(perfect, ()), Rig(perfect, (e,))
     trace = np.concatenate([with_it.reading(r) - without.reading(r) for r in runs])

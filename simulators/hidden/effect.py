@@ -1,4 +1,4 @@
-"""A hidden effect, its changes of a run, and the registry of all effects."""
+"""A hidden effect, the changes that it causes in a run, and the registry of all effects."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
@@ -15,7 +15,7 @@ STREAM_WILD = 41
 
 @dataclass(slots=True)
 class Bend:
-    """Changes of an effect in a run.
+    """Changes that an effect causes in a run.
 
     ``drive`` (n, 3) mm: axis positions minus commanded ones. ``shift`` (3, n, 3) mm, ``angle`` (3, n, 3) rad: additional error motions of
     carriages X, Y, Z. ``reading`` (n,) mm: error of the instrument itself. ``beam``, ``tilt`` (2,) rad: misalignment of laser beam and
@@ -93,7 +93,7 @@ class Hidden:
         return -size if signed and rng.random() < 0.5 else size
 
     def bend(self, track: Track) -> Bend:
-        """Return the changes of the effect in this run."""
+        """Return the changes that the effect causes in this run."""
         out = Bend.none(track.n)
         BOOK[self.name](self, track, out)
         return out

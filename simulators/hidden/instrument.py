@@ -36,7 +36,10 @@ def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("setup_centre_offset")
 def setup_centre_offset(e: Hidden, track: Track, out: Bend) -> None:
-    """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up. (Here the tool shifts.)"""
+    """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up.
+
+    Simulated by a shift of the tool.
+    """
     if track.kind == "bar" and track.number >= 0:
         away = e.rng(21, zlib_of(track.setup)).normal(size=3)
         out.shift[2] -= e["strength"] * UM * away / np.linalg.norm(away)

@@ -29,7 +29,7 @@ def packaged() -> list[Path]:
 def picked(seed: int) -> Scenario:
     """Return the packaged scenario that a seed picks (see `winner`), with its machine drawn from the same seed.
 
-    Adding a scenario changes the pick only of those seeds that it wins.
+    A new scenario changes only the picks of the seeds that pick it.
 
     Raises
     ------

@@ -59,9 +59,10 @@ CREEP_MM_S = 4.5
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
-    """Find out whether laser outliers belong to a position: return how much other readings near them deviate alike, and that position.
+    """Find out whether laser outliers belong to a position: return the common deviation of other readings near them, and that position.
 
-    Units: standard deviations; mm, shape (3,). A lost beam affects no other readings nearby; the first value is then within 3.
+    The deviation is in standard deviations, the position in mm, shape (3,). A lost beam affects no other readings nearby; their common
+    deviation is then within 3.
 
     Parameters
     ----------

@@ -192,8 +192,8 @@ class Layout:
     low_mm, high_mm : array, shape (3,)
         Range of X, Y, Z.
     terms : tuple of (i, j, k)
-        Monomials to fit. On h parallel planes: those whose power of the coordinate normal to the planes is below h (one plane normal to Z: the
-        ten in X, Y). Otherwise all 20. Points on other surfaces (crossing planes, a sphere) get all 20 but do not determine them.
+        Monomials to fit. On h parallel planes: those whose power of the coordinate normal to the planes is below h (one plane normal to Z:
+        the ten in X, Y). Otherwise all 20. Points on other surfaces (crossing planes, a sphere) get all 20 but do not determine them.
     tolerance_mm : float
         Largest distance of a point from its plane.
     """

@@ -1,8 +1,9 @@
-"""Errors of a plane that the poses of a probed artefact show, errors that they hide, and the further pose that would show those.
+"""Errors of a plane that the poses of a probed artefact show, errors that these poses hide, and a further pose that would show those.
 
-The form of the artefact is free, so only what moves against it shows. The analysis takes fields of the machine in the plane up to degree 4
-(27 beside rigid motions), the points of every pose, a free pose each and a free form, all of first order; without a calibrated length the
-artefact's scale is free, too. Source: artefact-based self-calibration (reversal, rotation, translation), Evans, Hocken and Estler 1996.
+The form of the artefact is unknown. So only errors of the machine that move relative to the artefact become visible. The analysis is of
+first order. Its unknowns: fields of the machine in the plane up to degree 4 (27 beside rigid motions), one pose per run, and the form;
+without a calibrated length also the artefact's scale. Source: artefact-based self-calibration (reversal, rotation, translation), Evans,
+Hocken and Estler 1996.
 """
 
 from __future__ import annotations

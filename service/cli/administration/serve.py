@@ -196,7 +196,10 @@ def duties_on(
 
 
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
-    """Return a function from the service's store to the orders for tables; it offers a push only if the service never pushes by itself."""
+    """Return a function that makes, from the service's store, the orders for tables.
+
+    A push is among them only if the service never pushes by itself.
+    """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved
     from abbe.service.compensation.rollback import ordered_rollback
@@ -215,7 +218,10 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
 
 
 def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Callable[[Store], MeasureCampaign]:
-    """Return a function from the service's store to the job of a full campaign that a person starts; ``folder``: of recipe files."""
+    """Return a function that makes, from the service's store, the job of a full campaign that a person starts.
+
+    ``folder``: folder of the recipe files.
+    """
     from abbe.service.clock import SystemClock
     from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext

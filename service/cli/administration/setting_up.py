@@ -41,9 +41,9 @@ def init(  # noqa: PLR0913 - one option for each question
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Write a commented machine file from eight answers: of options, or asked at the terminal. An existing file is refused.
+    """Write a commented machine file from eight answers, given as options or at the terminal. An existing file is never overwritten.
 
-    Serial ports that are plugged in are offered for the ball-bar. The file is read again before it is kept: a wrong answer leaves none.
+    For the ball-bar it offers the serial ports that are plugged in. It checks the file before it keeps it: a wrong answer leaves no file.
     """
     from abbe.service.config import load_machine
     from abbe.service.domain.machine import DeviceUrls

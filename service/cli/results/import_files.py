@@ -63,8 +63,8 @@ def import_files(  # noqa: PLR0913 - one argument for each option
 
     Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
     about their columns; the answers are kept as FILE.columns.toml. Lists of an artefact's points, one file for each pose,
-    need no questions (docs/reference/instrument-files.md). What files do not say is asked, or stays unknown and widens U.
-    Temperatures of the options count for files that state none. -m FILE: the machine with its chain and strokes, and its
+    need no questions (docs/reference/instrument-files.md). Facts that files do not state are asked for, or stay unknown and widen U.
+    Temperatures given as options apply to files that state none. -m FILE: the machine with its chain and strokes, and its
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
     from abbe.service.instrument_files.answers import Answers

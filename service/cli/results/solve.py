@@ -91,7 +91,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve a campaign: parameters with uncertainty, and those that these runs do not determine. The result is stored; nothing is pushed.
 
-    A folder's result is stored only if --db or -m names a database; tables that only this database holds then count, too. A run that
+    A folder's result is stored only if --db or -m names a database; tables of this database are then used, too. A run that
     contradicts its description is refused (exit code 2).
     """
     from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution

@@ -182,7 +182,7 @@ def approve(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Approve exactly this table, in place of exactly the present one, for this machine and its limits (exit code 1: not approved)."""
+    """Approve this one table as replacement of the present one, for this machine and its limits (exit code 1: not approved)."""
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.proposal_decisions import approve as work_approve
     from abbe.service.errors import TableRefused

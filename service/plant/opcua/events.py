@@ -1,4 +1,4 @@
-"""Events of the OPC UA server: a check has ended, an alarm is new. What was known before the server began is in its variables only."""
+"""Events of the OPC UA server: a check has ended, an alarm is new. Facts from before the server began are in its variables only."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 class News:
     """Finds the checks and alarms that were not shown before.
 
-    Facts hold the newest alarms only: when one leaves a full list, an older one returns, which is not new. The alarm of a check has the
-    time at which the check began, so a later one may have been shown before it.
+    Facts hold only the newest alarms. If one leaves the full list, an older alarm returns to it: that one is not new. The time of an alarm
+    is that at which its check began, so alarms may not arrive in order of time.
 
-    ``since``: what ended or rose before the first facts and this time is not new.
+    ``since``: a check that ended, or an alarm that rose, before this time and before the first facts is not new.
     """
 
     def __init__(self, since: datetime) -> None:

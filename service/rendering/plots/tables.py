@@ -24,7 +24,7 @@ OLD, NEW = "s-c1 dash", "s-c2"
 def motion_bands(curves: Sequence[MotionCurve], *, key: str, link: str = "") -> str:
     """Error motions of one unit over their strokes, each with a band of U (k = 2); those not observable by themselves are dashed.
 
-    ``link``: address of the screen of a motion, which its name completes; empty: the panels lead nowhere.
+    ``link``: address to which the name of a motion is appended for its screen; empty: the panels have no links.
     """
     unit = curves[0].unit if curves else ""
     ends = [v for c in curves for v in (float((c.value - COVERAGE * c.u).min()), float((c.value + COVERAGE * c.u).max()))]

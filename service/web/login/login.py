@@ -88,8 +88,9 @@ def _add_logout(app: FastAPI, auth: Authenticator) -> None:
 async def identified(
     auth: Authenticator, origin: LoginOrigin, name: str, secret: str, *, by_pin: bool = False
 ) -> tuple[UserRecord | None, float, bool]:
-    """The user whose name and password (or PIN) these are, or None; seconds until the next try; False: not tried, after too many wrong
-    ones.
+    """Return the user with this name and password (or PIN), or None; seconds until the next try; whether the password was checked at all.
+
+    It is not checked after too many wrong tries.
     """
     wait_s = auth.lockout.wait_s(name, origin)
     if wait_s > 0:
@@ -105,7 +106,10 @@ async def identified(
 async def signature_refusal(
     auth: Authenticator, request: Request, password: str, wrong: str = "The password is wrong: nothing was signed."
 ) -> Response | None:
-    """Refusal of a signature by password of the person who is logged in; None: it is right. Wrong ones count as wrong logins."""
+    """Return the refusal of a wrong password that a logged-in person gave as signature; None: it is right.
+
+    A wrong password counts as a wrong login.
+    """
     visit: Visit = request.state.visit
     name = visit.principal.name.partition(":")[2].partition("/")[0]
     origin = await asyncio.to_thread(_login_origin, auth, request, name)

@@ -54,7 +54,10 @@ class Gauge:
 
 @dataclass(frozen=True, slots=True)
 class CheckScreen:
-    """One check. ``good``: the last earlier one of the recipe that passed; ``runs``: of its campaign; ``trouble``: why no curves."""
+    """One check.
+
+    ``good``: the last earlier check of the recipe that passed; ``runs``: runs of its campaign; ``trouble``: why there are no curves.
+    """
 
     check: Verification
     sentence: str

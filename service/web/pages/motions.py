@@ -32,7 +32,10 @@ SQUARE = {"C0Y": "XY", "B0Z": "XZ", "A0Z": "YZ"}
 
 @dataclass(frozen=True, slots=True)
 class MotionLine:
-    """One of the 21 motions: name in words; largest value with its U, and largest U over the stroke; ``hidden``: not by itself."""
+    """One of the 21 motions: name in words; largest value with its U, and largest U over the stroke.
+
+    ``hidden``: the runs do not show this motion by itself.
+    """
 
     name: str
     text: str

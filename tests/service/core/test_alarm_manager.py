@@ -481,4 +481,4 @@ async def test_after_a_kill_the_next_start_says_it_by_the_journal(bench: Bench) 
     await bench.journal(*KEPT)
     await bench.desk.due()
     last = bench.lines()[-1].facts
-    assert (last.word, last.text.endswith("(it was interrupted with the service)")) == ("kept", True)
+    assert (last.word, last.text.endswith("(it was interrupted when the service stopped)")) == ("kept", True)
