@@ -300,7 +300,7 @@ def _stated(filled: Filled) -> MachineFileSummary:
 
 
 @contextmanager
-def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
+def served(filled: Filled, *, users: bool = True, port: int = 0) -> Iterator[Served]:
     """The page over a filled store, on a real socket, in a thread with its own event loop."""
     clock = SystemClock()
     with Store.open(filled.url) as store:
@@ -317,7 +317,7 @@ def served(filled: Filled, *, users: bool = True) -> Iterator[Served]:
         sources = Sources(
             reader=view.reader, schedules=filled.schedules, devices=lambda: board.devices, rules=rules, tail=tail, stated=_stated(filled)
         )
-        listening = bind("127.0.0.1", 0)
+        listening = bind("127.0.0.1", port)
         server = make_server(create_app(view, version="0.1.0", auth=auth, api=sources))
         thread = threading.Thread(target=lambda: asyncio.run(server.serve(sockets=[listening])))
         thread.start()

@@ -196,6 +196,8 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
     async def icon() -> Response:
         return Response(ICON, media_type="image/svg+xml")
 
+    _add_installable(app)
+
     @app.get("/api/v1/status", responses=unavailable)
     @needs(Permission.READ)
     async def status() -> Status:
@@ -220,3 +222,31 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
         """The store is readable and the core answers."""
         await source.ready()
         return Health()
+
+
+MANIFEST = {
+    "name": "Abbe",
+    "short_name": "Abbe",
+    "start_url": "/",
+    "scope": "/",
+    "display": "standalone",
+    "background_color": "#eef0f2",
+    "theme_color": "#22506e",
+    "icons": [{"src": "/icon.svg", "sizes": "any", "type": "image/svg+xml", "purpose": "any maskable"}],
+}
+"""With it a browser installs the page as a program of a panel or a phone."""
+
+
+def _add_installable(app: FastAPI) -> None:
+    worker = (HERE / "static" / "sw.js").read_text(encoding="utf-8")
+
+    @app.get("/manifest.webmanifest", include_in_schema=False)
+    @needs(PUBLIC)
+    async def manifest() -> Response:
+        return JSONResponse(MANIFEST, media_type="application/manifest+json")
+
+    @app.get("/sw.js", include_in_schema=False)
+    @needs(PUBLIC)
+    async def service_worker() -> Response:
+        """The service worker; it controls only screens below its own address."""
+        return Response(worker, media_type="text/javascript")

@@ -24,7 +24,7 @@ HEADERS = {
     "Cross-Origin-Opener-Policy": "same-origin",
     "Cross-Origin-Resource-Policy": "same-origin",
 }
-KEPT = ("/static/", "/icon.svg")
+KEPT = ("/static/", "/icon.svg", "/sw.js", "/manifest.webmanifest")
 """Content that is the same for all visitors: browsers may cache and revalidate it. They cache nothing else."""
 HSTS = "max-age=31536000"
 """A year; sent only over TLS, and without effect for a page requested by address instead of by name."""

@@ -18,8 +18,8 @@ NAMES: Mapping[str, str] = dict(zip(LANGUAGES, ("English", "Deutsch", "日本語
 DEFAULT = ENGLISH
 FOLDER = Path(__file__).parent / "catalogues"
 SPAN_KEYS = (
-    "span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core", "login",
-    "strip.stopped", "strip.nothing", "strip.failed", "strip.out",
+    "span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core", "lost.at", "login",
+    "strip.stopped", "strip.nothing", "strip.failed", "strip.unreached", "strip.out",
 )  # fmt: skip
 """Texts of the script that every screen has."""
 

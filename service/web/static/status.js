@@ -80,7 +80,7 @@ async function stop(button) {
   const show = (text) => setText("stop-answer", text);
   const answer = await fetch("/api/v1/stop", { method: "POST", headers: { "X-CSRF-Token": button.dataset.csrf } }).catch(() => null);
   if (answer?.ok) show(words["strip.stopped"]);
-  else show(answer?.status === 409 ? words["strip.nothing"] : words["strip.failed"]);
+  else show(words[answer === null ? "strip.unreached" : answer.status === 409 ? "strip.nothing" : "strip.failed"]);
 }
 
 document.addEventListener("click", (event) => {
@@ -103,10 +103,13 @@ async function replaceContent(next) {
 }
 
 const LOST = banner.textContent;
+// Set by the service worker: this page comes from its store, since the service could not be reached.
+const kept = document.documentElement.dataset.kept;
+let seen = new Date(kept ?? Date.now());
 
 function connected(yes, silent = false) {
   banner.hidden = yes;
-  banner.textContent = silent ? words["lost.core"] : LOST;
+  if (!yes) banner.textContent = `${silent ? words["lost.core"] : LOST} ${filled("lost.at", "time", seen.toLocaleString("sv-SE"))}`;
   document.body.classList.toggle("stale", !yes);
 }
 
@@ -135,6 +138,8 @@ async function refresh() {
       throw new Error(`status ${answer.status}`);
     }
     const status = await answer.json();
+    if (kept) { location.reload(); return; }
+    seen = new Date();
     // The screen of an unavailable core has no revision: reload it, now that the core answers.
     if (revision === "") { location.reload(); return; }
     if (revision !== undefined && status.revision !== revision) await replaceContent(status.revision);
@@ -148,5 +153,7 @@ async function refresh() {
   setTimeout(refresh, PERIOD_MS);
 }
 
+if (kept) connected(false);
+navigator.serviceWorker?.register("/sw.js").catch(() => {});  // refused without TLS or with an unknown certificate: then nothing is kept
 setTimeout(refresh, PERIOD_MS);
 document.documentElement.dataset.ready = "yes";

@@ -154,7 +154,7 @@ async def test_every_route_says_what_it_needs(gate: Gate) -> None:
     undeclared = [(method, path) for method, path, need in route_permissions(gate.app.routes) if need is None]
     assert undeclared == []
     public = {path for _, path, need in route_permissions(gate.app.routes) if isinstance(need, Open)}
-    assert public == {"/icon.svg", "/healthz", "/readyz", "/static", "/login"}
+    assert public == {"/icon.svg", "/manifest.webmanifest", "/sw.js", "/healthz", "/readyz", "/static", "/login"}
     without = app_of(gate.world, None)
     assert all(need is not None for _, _, need in route_permissions(without.routes))
 
