@@ -67,6 +67,11 @@ def tool(name: str) -> str:
     return str(Path(sys.executable).parent / name)
 
 
+def test_no_file_keeps_the_marks_of_a_merge() -> None:
+    marks = re.compile(rb"^(<{7}|>{7}) ", re.MULTILINE)
+    assert [str(path) for path in tracked_files() if path.is_file() and marks.search(path.read_bytes())] == []
+
+
 def test_what_lies_beside_a_database_is_not_committed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """README lets Abbe work in the clone: a `git add .` must not take the key of the audit along. The names are those that are made."""
     if not (ROOT / ".git").exists() or shutil.which("git") is None:
