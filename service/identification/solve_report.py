@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from dataclasses import dataclass, replace
 from typing import Literal, cast
 
@@ -321,7 +322,7 @@ def _inputs(found: Assessment, model: str) -> Inputs:
 
 
 def _runs(joint: JointSolution) -> dict[str, RunResult]:
-    counts = {r.label: sum(o.run == r.label for o in joint.outliers) for r in joint.runs}
+    counts = Counter(o.run for o in joint.outliers)
     return {
         r.label: RunResult(readings=r.residual_mm.size, rms_um=r.rms_mm * 1e3, expected_um=r.expected_mm * 1e3, outliers=counts[r.label])
         for r in joint.runs

@@ -36,22 +36,23 @@ def compared(progress: Callable[[str], None]) -> dict:
             fill(store, Path(folder), range(1, CAMPAIGNS + 1))
             tasks = tasks_of(store, url, "june-*", MODEL)
         progress("reanalysis: one process")
-        wanted, first_s = _timed(SerialExecutor(), tasks)
+        wanted, first_s = timed(SerialExecutor(), tasks)
         found = {"one process": {"wall_s": first_s, "right": all(json.loads(wanted)), "cores": len(os.sched_getaffinity(0))}}
         for workers in WORKERS:
             progress(f"reanalysis: {workers} processes")
-            told, wall_s = _timed(ProcessExecutor(workers), tasks)
+            told, wall_s = timed(ProcessExecutor(workers), tasks)
             found[f"{workers} processes"] = {"wall_s": wall_s, "right": told == wanted}
         if importlib.util.find_spec("distributed") is not None:
             progress(f"reanalysis: Dask, {WORKERS[-1]} workers")
             with dask_cluster(WORKERS[-1]) as address:
-                told, wall_s = _timed(DaskExecutor(address), tasks)
+                told, wall_s = timed(DaskExecutor(address), tasks)
             found[f"Dask, {WORKERS[-1]} workers"] = {"wall_s": wall_s, "right": told == wanted}
     progress("")
     return found
 
 
-def _timed(executor: Executor, tasks: list[ReanalysisTask]) -> tuple[str, float]:
+def timed(executor: Executor, tasks: list[ReanalysisTask]) -> tuple[str, float]:
+    """The answers of an executor as text, and the seconds that they took."""
     start = time.perf_counter()
     docs = [one.doc for one in solve_all(tasks, executor)]
     return json.dumps(docs), time.perf_counter() - start
