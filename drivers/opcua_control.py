@@ -69,7 +69,9 @@ class OpcUaControl(ListenedControl):
         found = UNECE.get(unit_id, "")
         if not found or (self._unit and found != self._unit):
             what = found or f"of unit {unit_id}, which is no length known here"
-            raise WrongDevice(self.name, "identify", f"the position of {axis.upper()} is in {what}; stated is {self._unit or 'nothing'}")
+            raise WrongDevice(
+                self.name, "identify", f"the position of {axis.upper()} is in {what}; the URL states {self._unit or 'no unit'}"
+            )
         return found
 
     async def _properties(self, axis: str) -> list[Any]:

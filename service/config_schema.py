@@ -180,7 +180,7 @@ class Limits(ConfigTable):
 
 
 class AxisCoefficients(ConfigTable):
-    """One expansion coefficient for each axis, 1/K; an absent axis is not reduced."""
+    """One expansion coefficient for each axis, 1/K. An axis without one is not reduced to 20 °C."""
 
     X: Coefficient | None = None
     Y: Coefficient | None = None

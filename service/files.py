@@ -78,7 +78,7 @@ def read_plain(path: Path, most: int) -> bytes:
         while piece := file.read(min(PIECE, most + 1 - len(content))):
             content += piece
     if piece is None:
-        raise NotPlainError(errno.EAGAIN, "it has nothing to read yet: no plain file", str(path))
+        raise NotPlainError(errno.EAGAIN, "it waits for data, expected a plain file", str(path))
     if len(content) > most:
         size = f"{most >> 20} MiB" if most >> 20 else f"{most} bytes"
         raise NotPlainError(errno.EFBIG, f"it is larger than {size}", str(path))

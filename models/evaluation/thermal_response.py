@@ -96,7 +96,7 @@ class Shift:
     p: float
 
     def holds(self, run: int) -> bool:
-        """Whether it acts in a run."""
+        """Whether the offset acts in a run."""
         return self.first <= run <= self.last
 
 

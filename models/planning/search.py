@@ -136,7 +136,7 @@ class PlanSearch:
         return ranked[0] if ranked else None
 
     def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
-        """Rank the affordable tests of the pool and those at cups already chosen by gain / minutes^thrift, best first."""
+        """Rank the affordable tests, of the pool and at cups already chosen: highest gain / minutes^thrift first."""
         costs = self._affordable(chosen, budget_min, pool)
         if not costs:
             return []

@@ -144,7 +144,7 @@ class ArtefactPriors:
     sway_mm_s : drift of the pose: 0.3 um in 10 minutes.
     form_mm : place of a feature against its nominal one; the size is estimated from the data.
     scale : of an artefact without a calibrated length.
-    shear : difference of scale of the artefact's two axes and squareness: it was made by some machine.
+    shear : difference in scale of the artefact's two axes, and its squareness: errors of the machine that made it.
     twist_mm : smooth form; estimated from the data.
     stylus_mm : radius of stylus with pre-travel, or of the cutter.
     lobing_mm : estimated from the data.

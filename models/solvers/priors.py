@@ -294,7 +294,7 @@ def _rough_parts(machine: Machine, terms: tuple[Term, ...], p: int) -> tuple[tup
 
 
 def with_shapes(model: SizeModel, length: float, ends: float) -> SizeModel:
-    """Return the size model with another correlation length of the error motions, strokes, and share of variance at the ends."""
+    """Return the size model with another correlation length of the error motions (in strokes) and share of variance at the ends."""
     root = model.root.copy()
     for at in model.blocks:
         shapes, variance = smooth_shapes(at.size + 1, length, ends)

@@ -305,8 +305,8 @@ class CampaignRun:
     async def untouched(self, item: Item) -> bool:
         """Whether the set-up is still usable after a person may have touched it.
 
-        Without kept readings the set-up does not matter, and a resumed laser run reads its last point again. Otherwise a person must
-        confirm: the repeated stretch of a path shows a displacement of the cup along the bar, but not across it.
+        True if no readings are kept, and for a resumed laser run, which reads its last point again. Otherwise a person must confirm:
+        repeating a stretch of the path shows whether the cup has moved along the bar, but not across it.
         """
         if item.resume_trail.carried:
             return True

@@ -119,7 +119,7 @@ def drop(source: Path, to: Place, *, machine: str, form: str, now: datetime) -> 
     Raises
     ------
     FileFormatError
-        The files were dropped already, or a file cannot be written or is another one when read back.
+        The files were dropped already, or a file cannot be written, or reads back with other content.
     DriverError
         The server of the files does not answer.
     """

@@ -123,7 +123,7 @@ class _OrderJob(Job[JobOutcome]):
         return SlotState.of(outcome)
 
     async def interrupted(self) -> None:
-        await self._trail.write(STOPPED, "stopped with the service; completed runs are kept")
+        await self._trail.write(STOPPED, "stopped: the service stopped; completed runs are kept")
 
 
 Look = Callable[[], JobOutcome | None]
@@ -145,7 +145,7 @@ class _TableOrderJob(_OrderJob):
         """Record the order's outcome by the push journal; the next start rolls back an open push."""
         done = await asyncio.to_thread(self._look) or JobOutcome("failed", "the service ended before anything was written")
         log.warning("order interrupted by the end of the service", kind=self.kind, word=done.word, text=done.text)
-        await self._trail.write(done.word, f"{done.text} (stopped with the service)")
+        await self._trail.write(done.word, f"{done.text} (stopped because the service stopped)")
 
 
 def full_campaigns(

@@ -107,7 +107,7 @@ def _shared(folder: Path) -> Path:
     if found.st_mode & SHARED != SHARED:
         if found.st_uid != os.geteuid():
             raise UnsafeToMove(
-                f"{folder} has the mode {stat.S_IMODE(found.st_mode):o}: other accounts could not make or could remove a lock",
+                f"{folder} has the mode {stat.S_IMODE(found.st_mode):o}: with it, other accounts cannot make a lock, or can remove one",
                 f"as its owner or root, run: chmod {SHARED:o} {folder}",
             )
         folder.chmod(SHARED)

@@ -197,9 +197,9 @@ class Issuer(ConfigTable):
 class Rules:
     """Rules from a machine file, as reports and pages use them.
 
-    ``limits_um``: of figures, named as in `abbe.service.verification.verify.figure_rows`; ``calibrated_until``: certificates, by
-    instrument; ``temperature_c``: allowed, of the air; ``materials``: expansion of the scales by axis; ``instruments``: what identifies
-    each, with its certificate; ``issuer``, ``item``: of a certificate, None without a laboratory.
+    ``limits_um``: limits of figures, named as in `abbe.service.verification.verify.figure_rows`; ``calibrated_until``: last day of the
+    certificate, by instrument; ``temperature_c``: allowed range of the air; ``materials``: expansion of the scales, by axis;
+    ``instruments``: identity and certificate, by instrument; ``issuer``, ``item``: for a certificate, None without a laboratory.
     """
 
     limits_um: dict[str, float] = field(default_factory=dict)

@@ -158,7 +158,7 @@ def solve_runs(
 
 
 def value_rows(runs: list[Run], data: tuple[RunData, ...]) -> dict[str, NDArray[np.int64]]:
-    """Return the first and last row of the run's file, from 1, that each value was made of, by run label, shape (values, 2).
+    """Return, by run label, the first and last row (from 1) of the run's file that went into each value, shape (values, 2).
 
     Long runs are averaged in blocks. A row belongs to the value with the nearest mean time; invalid rows belong to none.
     """

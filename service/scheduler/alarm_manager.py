@@ -159,7 +159,7 @@ class AlarmManager(RetryingStore):
         """Record the state of a push at once when the end of the service interrupts it."""
         done = await asyncio.to_thread(self._of_proposal, found.proposal, after) or NOTHING_YET
         log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
-        text = f"{done.text} (stopped with the service)"
+        text = f"{done.text} (stopped because the service stopped)"
         await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
 
     def _of_proposal(self, proposal: int, after: int) -> JobOutcome | None:

@@ -90,7 +90,7 @@ Tick = Callable[[float, float], None]
 
 
 class Runner:
-    """Runs tests on one session; ``expected`` is checked when a pause ends."""
+    """Runs tests on one session. ``expected``: start of the controller and table in force, which must be the same after a pause."""
 
     def __init__(
         self,

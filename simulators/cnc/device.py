@@ -178,7 +178,7 @@ class Result(IntEnum):
 
 @dataclass(frozen=True, slots=True)
 class Felt:
-    """Contacts of a straight move: lengths after which the probe trips, the axes then stop, and the stylus breaks; None: it does not."""
+    """Contacts of a straight move: lengths at which the probe trips (None: never), the axes stop, and the stylus breaks (None: never)."""
 
     trip_mm: float | None = None
     stop_mm: float = 0.0

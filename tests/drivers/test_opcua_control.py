@@ -153,7 +153,7 @@ async def test_positions_are_read_with_unit_and_quality(plant: Plant) -> None:
             await control.write_bank(0, b"")
     finally:
         await control.close()
-    with pytest.raises(WrongDevice, match="X is in mm; stated is in"):
+    with pytest.raises(WrongDevice, match="X is in mm; the URL states in"):
         await _open(plant.asked("in"))
 
 

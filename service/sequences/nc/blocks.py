@@ -122,7 +122,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
     count = 0
     blocks: list[Block] = []
     if any(isinstance(s, TouchFeature) for t in plan.tests for s in t.steps):
-        raise ConfigError("an NC program of Abbe does not touch", "use the control's own measuring cycles, and import their points")
+        raise ConfigError("Abbe's NC programs cannot probe an artefact", "use the control's own measuring cycles, and import their points")
     for test in plan.tests:
         blocks.append(Comment(f"test {test.label}: {test.test} in set-up {test.setup_id}"))
         for block in _test(test, arcs):

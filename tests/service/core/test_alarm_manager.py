@@ -409,7 +409,7 @@ async def test_what_stays_open_is_told_and_told_again_when_it_is_closed(bench: B
     with pytest.raises(asyncio.CancelledError):
         await task
     assert [line.facts.word for line in bench.lines()] == ["", "open"]
-    assert bench.lines()[-1].facts.text.endswith("(stopped with the service)")
+    assert bench.lines()[-1].facts.text.endswith("(stopped because the service stopped)")
     for _ in range(2):
         await bench.desk.due()
     assert len(bench.lines()) == 2  # once is enough

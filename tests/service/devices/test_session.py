@@ -167,7 +167,7 @@ def test_a_folder_for_all_accounts_has_to_keep_them_from_each_others_files(folde
     shared.chmod(0o777)
     monkeypatch.setattr(os, "geteuid", lambda: shared.stat().st_uid + 1)
     with (
-        pytest.raises(UnsafeToMove, match="open has the mode 777: other accounts could not make or could remove a lock") as told,
+        pytest.raises(UnsafeToMove, match="open has the mode 777: with it, other accounts cannot make a lock, or can remove one") as told,
         lock_machine(URL),
     ):
         pass

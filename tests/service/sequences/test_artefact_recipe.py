@@ -76,7 +76,7 @@ def test_what_cannot_be_touched_is_named(change, what):
 
 
 def test_an_nc_program_does_not_touch():
-    with pytest.raises(ConfigError, match="does not touch"):
+    with pytest.raises(ConfigError, match="cannot probe an artefact"):
         program("m", CampaignPlan("plate", (TEST.plan(MACHINE),)), MACHINE.stroke_mm)
 
 
