@@ -198,7 +198,7 @@ async def open_opcua(url: str) -> OpcUaControl:
     query, access = _split(url)
     unit = query.pop("unit", "")
     if not set(AXES) <= set(query) <= {*AXES, "moving"} or unit not in ("", *MM) or not urlsplit(url).hostname:
-        remedy = "opc.tcp://HOST:PORT/?x=NODE&y=NODE&z=NODE, if need be &moving=NODE and &unit=mm, um, m or in; a node: ns%3D2%3Bs%3DX"
+        remedy = "write opc.tcp://HOST:PORT/?x=NODE&y=NODE&z=NODE, with a NODE such as ns%3D2%3Bs%3DX; optional: &moving=NODE, &unit=mm"
         raise BadUrl(ascii(url), "read device URL", "nodes of X, Y and Z are needed", remedy)
     client = await _connected(url, access)
     try:
@@ -219,7 +219,9 @@ async def open_files(url: str) -> OpcUaFiles:
     """
     query, access = _split(url)
     if not query:
-        raise BadUrl(ascii(url), "read URL", "it names no file", "opc.tcp://HOST:PORT/?NAME=NODE, a node: ns%3D2%3Bs%3DTable")
+        raise BadUrl(
+            ascii(url), "read URL", "it names no file", "write opc.tcp://HOST:PORT/?NAME=NODE, for example NODE ns%3D2%3Bs%3DTable"
+        )
     client = await _connected(url, access)
     try:
         return OpcUaFiles(url, client, query)
@@ -245,7 +247,7 @@ def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
         wrong = "a password is sent over an encrypted session only: certificate, key and server are missing"
     missing = [path for key, path in access.items() if key != "user" and not Path(path).is_file()]
     if wrong or missing:
-        raise BadUrl(ascii(url), "read device URL", wrong or f"{missing[0]}: no such file", "&certificate=FILE&key=FILE&server=FILE")
+        raise BadUrl(ascii(url), "read device URL", wrong or f"{missing[0]}: no such file", "write &certificate=FILE&key=FILE&server=FILE")
     return query, access
 
 

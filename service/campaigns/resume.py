@@ -57,7 +57,7 @@ def read_journal(store: Store, campaign: CampaignRecord) -> JournalEntries:
     if not begun:
         raise PreconditionsChanged(
             f"campaign {campaign.name!r} has no journal",
-            "it was imported, or measured by an older Abbe: measure it anew under another name",
+            "it was imported, or measured by an older version of Abbe: measure it anew under another name",
         )
     hand = tuple(lines_of(found, HandLine))
     last = max(k for k, one in enumerate(found) if one.kind == BEGUN)

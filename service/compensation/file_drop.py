@@ -68,7 +68,7 @@ class ControlFolder:
 
 
 class OpcUaPlace:
-    """The file objects of an OPC UA server as that place: ``opc.tcp://HOST:PORT/?NAME=NODE``."""
+    """The file objects of an OPC UA server as the place where a control reads files: ``opc.tcp://HOST:PORT/?NAME=NODE``."""
 
     def __init__(self, url: str) -> None:
         self.name = url

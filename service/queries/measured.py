@@ -234,7 +234,7 @@ def samples(reader: Reader, run: int, channel: str, first: int, limit: int) -> S
             taken = [sample for chunk in found for sample in decode_bar(chunk.payload)][at]
             return Samples(run=run, channel=channel, first=first, count=len(taken), total=total, bar=_columns(taken))
         if not codecs <= {JSON_CODEC}:
-            raise StoreError(f"run {run}, channel {channel!r}: unknown codec ({', '.join(sorted(codecs))})", "use a newer Abbe")
+            raise StoreError(f"run {run}, channel {channel!r}: unknown codec ({', '.join(sorted(codecs))})", "use a newer version of Abbe")
         records = [finite(one) for chunk in found for one in decode_json(chunk.payload)][at]
     return Samples(run=run, channel=channel, first=first, count=len(records), total=total, records=records)
 

@@ -261,6 +261,7 @@ def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRe
     for chunk in found:
         if chunk.codec != codec:
             raise StoreError(
-                f"run {chunk.run_id}, chunk {chunk.seq} of channel {channel!r}: unknown codec {chunk.codec!r}", "use a newer Abbe"
+                f"run {chunk.run_id}, chunk {chunk.seq} of channel {channel!r}: unknown codec {chunk.codec!r}",
+                "use a newer version of Abbe",
             )
     return found

@@ -79,5 +79,7 @@ def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: b
                 f"this solution was measured while {name} corrected the machine: files made from it would remove that correction", REMEDY
             )
         if acts is None and not confirmed_none:
-            raise FormatRefused(f"this solution was measured with {name}, without a record whether that table was in force", CONFIRM_REMEDY)
+            raise FormatRefused(
+                f"this solution was measured with {name}; it is not recorded whether that table was in force", CONFIRM_REMEDY
+            )
     return bool(tables) or confirmed_none

@@ -130,7 +130,7 @@ def shelve(store: Store, machine: str, number: int, name: str, reason: str, hour
     if one.word == "closed":
         raise AlarmRefused(f"alarm {number} is over and acknowledged", "there is nothing to shelve")
     if not timedelta() <= time <= LONGEST_SHELF or (hours > 0 and not reason.strip()):
-        raise AlarmRefused("to shelve an alarm needs a reason and a time", f"at most {LONGEST_SHELF.days} days")
+        raise AlarmRefused("shelving an alarm needs a reason and a time", f"give both; at most {LONGEST_SHELF.days} days")
     facts = AlarmFacts(name=name, reason=reason.strip(), until_utc=store.utcnow() + time)
     store.alarms.append(machine, number, one.last_seq + 1, AlarmKind.SHELVED, facts)
     return alarm_numbered(store, machine, number)

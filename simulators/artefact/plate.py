@@ -96,7 +96,7 @@ def placed(body: Plate, mounting: Mounting, time_s: float, temperature_c: float)
 
 
 def clearance(body: Plate, mounting: Mounting, centres_mm: F, at_mm: F, radius_mm: float) -> F:
-    """Return the distance, mm, of a sphere of this radius from the material, at places (n, 3) mm in workpiece coordinates; negative: inside."""
+    """Return the distance, mm, of a sphere of this radius from the material, at n places (workpiece coordinates, mm); negative: inside."""
     own = (at_mm - mounting.origin_mm) @ mounting.matrix
     features = (centres_mm - mounting.origin_mm) @ mounting.matrix
     above = own[:, 2] - radius_mm

@@ -159,7 +159,9 @@ def write_step(
         print_json({"files": written, "place": step.place, "expected": step.expected})
         return
     typer.echo(f"wrote {', '.join(written)}\nload it instead of every other table; {step.place}: {step.expected}")
-    typer.echo("moved the other way, and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table")
+    typer.echo(
+        "if it moves the other way and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table"
+    )
     conclude(f"abbe comp export SOLUTION --format {form} --step-moved -10 --out tables", machine=machine)
 
 

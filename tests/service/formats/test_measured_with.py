@@ -77,7 +77,7 @@ def test_runs_that_name_no_table_get_the_note(export: Export, tmp_path: Path) ->
         (ACTING, "pushed", 2, "corrected the machine"),
         (ACTING, "in force before", 2, "corrected the machine"),
         (NONE, "in force before", 0, "wrote"),
-        (NONE, "never met", 2, "without a record whether"),
+        (NONE, "never met", 2, "not recorded whether"),
     ],
 )
 def test_of_older_runs_the_database_knows_what_their_table_was(
