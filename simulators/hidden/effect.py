@@ -31,7 +31,7 @@ class Bend:
 
     @classmethod
     def none(cls, n: int) -> "Bend":
-        """Return a bend without any change of n readings."""
+        """Return a bend that changes none of n readings."""
         return cls(np.zeros((n, 3)), np.zeros((3, n, 3)), np.zeros((3, n, 3)), np.zeros(n), np.zeros(2), np.zeros(2))
 
     def add(self, other: "Bend") -> "Bend":
