@@ -9,8 +9,10 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Sequence
 from html import escape
+from unicodedata import east_asian_width
 
 from abbe.service.rendering.numbers import printable
+from abbe.service.rendering.phrases import LANGUAGES, phrase
 
 XY = tuple[float, float]
 
@@ -134,12 +136,12 @@ class Svg:
         self.text((right, y + 18.0), text, "t-small", anchor="end")
 
     def legend(self, at: XY, entries: Sequence[tuple[str, str]]) -> None:
-        """Row of line samples with their names. ``entries``: style class of the line, name."""
+        """Row of line samples with their names, with room for the names in every language. ``entries``: style class of the line, name."""
         x, y = at
         for style, name in entries:
             self.line((x, y - 4.0), (x + 22.0, y - 4.0), style)
             self.text((x + 28.0, y), name, "t-small")
-            x += 44.0 + 6.2 * len(name)
+            x += 44.0 + 6.2 * max(_letters(phrase(lang, name)) for lang in LANGUAGES)
 
     def render(self) -> str:
         """The ``<svg>`` element, ready to stand inside an HTML page (which needs no namespace declaration)."""
@@ -151,6 +153,11 @@ class Svg:
             f'<desc id="{self._key}-d">{desc}</desc>'
         )
         return head + "\n".join(self._body) + "</svg>"
+
+
+def _letters(text: str) -> int:
+    """Width of a text in Latin letters; those of East Asia are twice as wide."""
+    return sum(2 if east_asian_width(letter) in "WF" else 1 for letter in text)
 
 
 def _finite(*points: XY) -> bool:

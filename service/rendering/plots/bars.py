@@ -12,6 +12,8 @@ from abbe.service.rendering.svg import Svg
 
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
 LABELS = 150.0
+SETUP_LABELS = 192.0
+"""Width of the column for names of parameters, those of set-ups among them, in the longest language."""
 FIGURES = 130.0
 """Width of the column for value and uncertainty of a ranking."""
 STATUS_STYLES = {"observed": "f-c1", "weak": "f-c3"}
@@ -74,13 +76,13 @@ def _one_unit(unit: str, rows: Sequence[tuple[str, float, float]], key: str) -> 
     svg = Svg(WIDTH, TOP + ROW * len(rows) + BOTTOM, key, f"Parameters in {unit}", f"Values with U (k = 2) in {unit}: {summary}.")
     svg.text((10.0, 18.0), f"Parameters in {unit}, whiskers U (k = 2)", "t-head")
     ends = [v for _, value, u in rows for v in (value - COVERAGE * u, value + COVERAGE * u)]
-    panel = Panel(LABELS, TOP, WIDTH - LABELS - 16.0, ROW * len(rows), data_range(ends, zero=True), (0.0, 1.0))
+    panel = Panel(SETUP_LABELS, TOP, WIDTH - SETUP_LABELS - 16.0, ROW * len(rows), data_range(ends, zero=True), (0.0, 1.0))
     panel.draw_x(svg, f"value in {unit}")
     zero = panel.x(0.0)
     svg.line((zero, TOP), (zero, TOP + panel.height), "zero")
     for i, (name, value, u) in enumerate(rows):
         at = (panel.x(value), TOP + ROW * (i + 0.5))
-        svg.text((LABELS - 8.0, at[1] + 4.0), name[:24], anchor="end")
+        svg.text((SETUP_LABELS - 8.0, at[1] + 4.0), name[:24], anchor="end")
         svg.error_bar(at, panel.x(COVERAGE * u) - zero, horizontal=True)
         svg.dot(at, 3.6, "f-c2", f"{name}: {plain(value)} {unit}, u {plain(u, 2)} {unit}")
     panel.draw_frame(svg)
