@@ -6,11 +6,13 @@ from typing import Any
 
 from abbe.service.domain.machine import Issuer
 from abbe.service.rendering.document import Document
+from abbe.service.rendering.phrases import ENGLISH
 
 TITLE = "Calibration certificate"
 OF_MEASUREMENTS = ("run", "campaign", "verification")
 WHOLE = "This certificate may be reproduced in full only, unless the laboratory has approved otherwise in writing."
 ONLY = "The results relate only to the item identified above, as it was measured, at the place and on the days stated."
+TRANSLATION = "This is a translation; the English certificate of the same number counts."
 INTERVAL = "No calibration interval is recommended."
 PLACES = {"laboratory": "in the laboratory", "customer": "at the customer's", "laboratoryBranch": "in a branch of the laboratory"}
 
@@ -31,7 +33,7 @@ def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
         "title": TITLE,
         "number": number,
         "facts": pairs,
-        "statements": [_traceable(document), ONLY, INTERVAL, WHOLE],
+        "statements": [_traceable(document), ONLY, INTERVAL, WHOLE, *([] if document.lang == ENGLISH else [TRANSLATION])],
         "missing": missing,
     }
 

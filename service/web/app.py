@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Annotated, Any
 
 from fastapi import FastAPI, Query
@@ -17,6 +17,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.plant.gather import FactsSource, Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusSource
+from abbe.service.rendering.phrases import phrase
 from abbe.service.storage.store import Store
 from abbe.service.users.roles import Permission
 from abbe.service.web import problems
@@ -27,9 +28,9 @@ from abbe.service.web.api.tables import add_table_orders, add_tables
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.document import SecurityHeaders, complete
 from abbe.service.web.error_pages import ErrorPages, add_core_unavailable
-from abbe.service.web.frame import FrameMiddleware
+from abbe.service.web.frame import FrameMiddleware, current
 from abbe.service.web.jobs import add_jobs
-from abbe.service.web.live import add_live
+from abbe.service.web.live import add_live, told
 from abbe.service.web.login.access import PUBLIC, needs
 from abbe.service.web.login.auth_middleware import AuthMiddleware
 from abbe.service.web.login.authentication import Authenticator
@@ -202,7 +203,8 @@ def _add_routes(app: FastAPI, source: StatusSource) -> None:
     @needs(Permission.READ)
     async def status() -> Status:
         """Devices, running check, next due, broker, last results."""
-        return await source.status()
+        found, lang = await source.status(), current().lang
+        return replace(found, job=told(found.job, lang), attention=[phrase(lang, text) for text in found.attention])
 
     @app.get("/api/v1/verifications", responses=unavailable)
     @needs(Permission.READ)

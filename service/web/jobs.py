@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Annotated
 
 from fastapi import FastAPI, Header, HTTPException, Path, Request
@@ -10,9 +11,11 @@ from fastapi.responses import JSONResponse, Response
 from abbe.service.channel.messages import Answer, Steering
 from abbe.service.domain.job_state import JobState
 from abbe.service.queries.reader import json_value
+from abbe.service.rendering.phrases import phrase
 from abbe.service.sequences.recipes.campaigns import named, split_recipe_name
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.problems import problem
@@ -129,4 +132,6 @@ def answered(core: CoreLine, answer: Answer) -> Response:
 
 
 def _find(core: CoreLine, number: str) -> JobState | None:
-    return next((job for job in core.jobs() if job.id == number), None)
+    """The job, its sentences in the reader's language."""
+    found, lang = next((job for job in core.jobs() if job.id == number), None), current().lang
+    return None if found is None else replace(found, text=phrase(lang, found.text), ask=phrase(lang, found.ask))

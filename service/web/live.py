@@ -95,14 +95,15 @@ def _event(core: CoreLine, revision: int, lang: str) -> str | None:
     """The current event as JSON, sentences in the reader's language; None while the core is silent."""
     try:
         attention = [phrase(lang, text) for text in core.attention]
-        job = _told(core.job, lang)
+        job = told(core.job, lang)
         event = LiveEvent(revision=revision, job=job, devices=core.devices, mqtt_connected=core.mqtt_connected, attention=attention)
     except CoreUnavailable:
         return None
     return _EVENT.dump_json(event).decode()
 
 
-def _told(job: RunningCheck | None, lang: str) -> RunningCheck | None:
+def told(job: RunningCheck | None, lang: str) -> RunningCheck | None:
+    """The running check with its sentences in a language."""
     if job is None:
         return None
     return replace(job, ask=phrase(lang, job.ask), message=phrase(lang, job.message), why=phrase(lang, job.why))

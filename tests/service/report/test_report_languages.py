@@ -20,6 +20,7 @@ from abbe.service.rendering import document_page
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_data import document_json, shown
 from abbe.service.rendering.document_page import document_html, document_pdf, write_document
+from abbe.service.rendering.laboratory import TRANSLATION
 from abbe.service.rendering.phrases import LANGUAGES, phrase
 from tests.conftest import Require
 from tests.languages import english
@@ -110,6 +111,14 @@ def test_the_command_line_takes_the_language_of_its_environment(monkeypatch: pyt
     monkeypatch.setenv("ABBE_LANGUAGE", "fr")
     with pytest.raises(FileFormatError, match="no language 'fr'"):
         write_document(plain, target)
+
+
+def test_a_certificate_in_another_language_is_a_translation_with_the_same_number(reports: dict[str, Document]) -> None:
+    one = reports["certificate"]
+    numbers = {lang: shown(replace(one, lang=lang))["certificate"]["number"] for lang in LANGUAGES}
+    assert len(set(numbers.values())) == 1
+    said = {lang: " ".join(shown(replace(one, lang=lang))["certificate"]["statements"]) for lang in LANGUAGES}
+    assert [lang for lang in LANGUAGES if "English certificate" in said[lang] or phrase(lang, TRANSLATION) in said[lang]] == [*OTHERS]
 
 
 def test_names_stay_names() -> None:

@@ -136,6 +136,19 @@ async def test_what_is_to_be_done_stands_on_both_screens(desk: Desk, plant: Plan
     assert (other["revision"] != revision, other["job"]["prompt"]) == (True, 4), "an open page is told"
 
 
+async def test_a_prompt_is_told_in_the_reader_s_language(desk: Desk, plant: Plant) -> None:
+    """On the screens, in the state of the job and in the status that keeps an open page fresh; a program gets English."""
+    text, german = "Take bar, cup, mirror or artefact away. Done?", "Stab, Pfanne, Spiegel oder Normal wegnehmen. Fertig?"
+    check = replace(asking(3).check, ask=text)  # type: ignore[type-var]
+    await desk.says(replace(JOB, ask=text), replace(asking(3), check=check, changes=200))
+    for told, lang in ((german, "de"), (text, "en")):
+        who = plant.session("operator") | {"Accept-Language": lang}
+        for path in ("/", "/live"):
+            assert told in await desk.page(path, who)
+        assert (await desk.client.get("/api/v1/status", headers=who)).json()["job"]["ask"] == told
+        assert (await desk.client.get(f"/api/v1/jobs/{NUMBER}", headers=who)).json()["ask"] == told
+
+
 async def test_it_is_started_from_the_checklist(desk: Desk, plant: Plant) -> None:
     who = plant.session("metrologist")
     await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
