@@ -58,7 +58,7 @@ def with_later_changes(document: Document, store: Store, machine: str, begun_utc
     if known.state == "unverified" and word != NOT_JUDGED:
         verdict = ("open", "Unverified now", f"{now}. When this was measured: {word}. {text}".strip())
     elif sign != "open":
-        verdict = ("open", f"{word} then", f"{text} Another table is in force now: {known.text}.".strip())
+        verdict = ("open", f"{word} then", f"{text.rstrip('.')}. Another table is in force now: {known.text}.".removeprefix(". "))
     return replace(document, verdict=verdict, remarks=[remark, *document.remarks])
 
 
