@@ -226,7 +226,8 @@ def _runs(still: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> list[tuple[
 def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
     """Return the side of approach of each standstill: +1 from smaller readings, -1 from larger, 0 unknown.
 
-    It compares the last sample that is farther from the standstill than an overshoot. ``smallest``: smallest planned move, unit of ``y``.
+    The last sample before the standstill that is farther away than an overshoot shows the side. ``smallest``: smallest planned move, in the
+    unit of ``y``.
     """
     out, least = np.zeros(len(found)), CLEAR * noise_of(y)
     for s in range(1, len(found)):

@@ -49,9 +49,10 @@ def interferometer(
     ] = 316.4,
     as_json: JsonOption = False,
 ) -> None:
-    """Find the cyclic error of an interferometer (periodic nonlinearity), orders 1 and 2 per fringe with U, from its quadrature signals.
+    """Find the cyclic error of an interferometer (periodic nonlinearity): orders 1 and 2 per fringe, with U.
 
-    Or from a slow linear run whose position is known much better than a fringe. Samples stand in the order in which they were taken.
+    From its quadrature signals, or from a slow linear run whose position is known much better than a fringe. The samples must be in the
+    order in which they were taken.
     """
     from abbe.service.instrument_files.interferometer import answer_doc, cyclic_error_of, lines_of
 

@@ -188,7 +188,7 @@ def _check_spacing(file: TextFile, last: int, grid: _Grid, position: F1) -> None
     if grid.spacing == 0.0 or off.size or abs(wanted[-1] - grid.end) > NEAR * max(1.0, abs(grid.end)):
         at = last - position.size + 1 + (int(off[0]) if off.size else position.size - 1)
         stated = f"from {grid.start:g} to {grid.end:g} in steps of {grid.spacing:g}"
-        raise file.wrong(at, f"{position.size} positions do not go {stated}, as the file says")
+        raise file.wrong(at, f"expected {position.size} positions {stated}, as the file states")
 
 
 def _content(name: str, data: bytes, form: str, said: Mapping[str, str], test: AxisReadings, *, unit_known: bool = True) -> Content:

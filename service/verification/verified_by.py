@@ -211,7 +211,7 @@ def _measured_with(store: Store, record: VerificationRecord, crc: int | None, si
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """Start of a check's campaign, after any table was accepted by the same command; without a campaign: start of the check."""
+    """Return when a check's campaign began, or the check if it has no campaign. A command that accepts a table does so before that."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)

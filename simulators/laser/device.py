@@ -52,7 +52,7 @@ class Mount:
     zero_mm: F
 
     def displacement(self, position_mm: F, turned_rad: F) -> F:
-        """Return how far the points where the true beam meets the mirror plane are from the zero along the beam, (n,) mm.
+        """Return the distance along the beam from the zero to the points where the true beam meets the mirror plane, (n,) mm.
 
         ``position_mm``, ``turned_rad`` (n, 3): place and rotation of the tool, with which the mirror turns.
         """
