@@ -49,7 +49,7 @@ class DescribedMeter:
 
     @property
     def resolution_mm(self) -> float:
-        """Smallest step of the readings, mm: by the device file, else of one count."""
+        """Smallest step of the readings, mm: as the device file states, else one count."""
         value = self.file.values["displacement"]
         return TO_OURS[value.unit][0] * (self.file.limits.resolution or value.scale)
 

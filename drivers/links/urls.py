@@ -125,7 +125,7 @@ class FixtureTcpUrl:
 
 @dataclass(frozen=True, slots=True)
 class FixtureConsoleUrl:
-    """The operator at the console."""
+    """URL of a fixture that a person operates; requests appear on the console."""
 
     def __str__(self) -> str:
         return "fixture+console:"

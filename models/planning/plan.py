@@ -1,8 +1,8 @@
 """Plan a campaign: which set-ups in which order, the uncertainty after each step, and what remains unobservable.
 
 The uncertainties are the posterior (Bayesian Cramer-Rao) bound of the planned readings, with the temperatures of bars and scales as in the
-solution's own budget (`abbe.models.uncertainty.inputs`). They leave out error motions above the planner's order, and that noise and typical
-sizes will be estimated from the readings.
+solution's own budget (`abbe.models.uncertainty.inputs`). They neglect error motions above the planner's order, and take noise and
+typical sizes as known, although the solver estimates them from the readings.
 """
 
 from __future__ import annotations

@@ -51,8 +51,8 @@ class AppliedTables:
     def moved_mm(self, axes_mm: F2) -> F2:
         """Displacement of the axes by the table at successive commands, shape (n, 3), mm.
 
-        It is the correction less the part that lost motion absorbs. It is relative to an axis without a table, which ends on the side of
-        the lost motion that its last command leads to.
+        It is the correction minus the part that lost motion absorbs. The reference is the same machine without a table: there each axis
+        ends on the side of its lost motion from which it came.
         """
         added = self.correction(axes_mm)
         if self.lost_mm is None:

@@ -12,7 +12,7 @@ from abbe.service.devices.session import Session, latest_reading, latest_status
 from abbe.service.domain.progress import MachineReading
 
 SHORTEST_S = 0.2
-"""Shortest time between two positions from which a feed is told, s."""
+"""Shortest time between two positions from which a feed is computed, s."""
 OLD_S = 5.0
 """An answer of the laser that is older, s, is not shown."""
 MM_PER_COUNT = 1e-7
@@ -20,7 +20,7 @@ MM_MIN_PER_MM_US = 6e7
 
 
 class LatestReading:
-    """Tells the latest state of a session's devices without asking any of them; call it in the event loop."""
+    """Return the latest state of a session's devices from their last answers, without a new query. Call it in the event loop."""
 
     def __init__(self, session: Session, clock: Clock, now_s: Callable[[], float] = time.monotonic) -> None:
         self._session, self._clock, self._now_s = session, clock, now_s

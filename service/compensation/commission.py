@@ -121,7 +121,7 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
     small_mm, step_mm = (max(round(s / lsb_mm), 1) * lsb_mm for s in (FIRST_MM, STEP_MM))
     if small_mm * LARGEST_RATIO > STROKE_MM:
         raise TableRefused(
-            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: its smallest step, taken for millimetres, exceeds the bar's stroke",
+            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: a control that reads it as mm would exceed the bar's stroke",
             "prove sign and unit with a dial indicator, with the axis clear of all obstacles; nothing was written",
         )
     tables = _base_tables(context.site, base)

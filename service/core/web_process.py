@@ -47,7 +47,7 @@ from abbe.service.errors import AbbeError, ChannelBroken
 FRAME_S = 0.05
 """Time between two messages with samples, s: 20 messages a second, each with about 50 samples at 1 kHz."""
 FRAMES_EACH = 2
-"""The state of the machine is told with every second message."""
+"""Every second message also carries the state of the machine."""
 NO_PATH = LivePath("path", RecordedPath())
 
 

@@ -53,7 +53,7 @@ class TableFactor:
 
 
 def table_factor(result: DemoResult) -> TableFactor:
-    """Return by how much the tables of a demonstration improved its machine, by the sealed truth."""
+    """Return by how much the tables of a demonstration improved its machine, according to the sealed truth."""
     before, after = result.truths
     best, rms0, rms1 = before.best_nine_tables_rms_um, before.volumetric_rms_um, after.volumetric_rms_um
     return TableFactor(rms0 / rms1, rms0 / best, best / rms1)

@@ -145,8 +145,9 @@ class Difference:
 def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
     """Return the total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
 
-    If the non-linear parameters agree and no other form was needed, this is the strength of the summed coefficients, scaled to the whole
-    strength that the entries state (`Effect.unseen`). Otherwise, and for an effect outside the catalogue, it is the sum of the strengths.
+    If the entries agree in their non-linear parameters and use the effect's main form, the total is the strength of the summed
+    coefficients, scaled to include the part that the present model absorbs (`Effect.unseen`). Otherwise, and for an effect outside the
+    catalogue, it is the sum of the strengths.
     """
     u, unit = float(np.hypot.reduce([e.u_strength for e in entries])), entries[-1].unit
     if effect is None or len(entries) == 1 or entries[0].forms or not _addable(entries):

@@ -89,7 +89,7 @@ def _lines(t: int, table: _CecTable, *, switches: bool) -> list[str]:
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
-    """Read the file as the control does; a table for one direction is zero in the other.
+    """Read the file as the control does; a table for one direction adds nothing in the other direction.
 
     Raises
     ------

@@ -80,7 +80,8 @@ class Verdict:
 def verdict(number: Number, prediction: Prediction, share: float, *, flags: int = 0, not_noise: int = 0, beside: str = "") -> Verdict:
     """Judge the usability of a solution.
 
-    The layout of the campaign limits the verdict. If the model does not fit, uncertainties are larger than the layout allows, and limit the verdict further.
+    The layout of the campaign limits the verdict. If the model does not fit, uncertainties are larger than the layout allows, and limit the
+    verdict further.
 
     Parameters
     ----------

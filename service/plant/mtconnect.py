@@ -1,7 +1,8 @@
 """MTConnect 1.8 documents of one machine: Devices, Streams and Error, made from facts. Pure except for the sequence numbers.
 
 `Agent` implements an MTConnect agent without assets, and without XPath (``path``) and streaming (``interval``). It observes the
-machine at each request. Of the time between two requests it reports all ended checks, ten at most, but not the changes of a running one.
+machine at each request. An answer contains the checks that ended since the last request, ten at most, but no earlier state of a running
+check.
 """
 
 from __future__ import annotations

@@ -50,10 +50,10 @@ class MachineStatus:
     heard_utc : str
         Time of the service's last heartbeat.
     check_utc, verdict : str
-        The last check. A verdict that is not about the table in force becomes ``unverified``, ``verified`` (by the push that activated the
-        table and was measured before and after) or ``unknown``.
+        The last check. If it did not check the table in force, the verdict is ``verified`` (the push of that table was measured before
+        and after), ``unverified`` or ``unknown``.
     figures : tuple of FleetFigure
-        Judged figures of the last check, in its order; none if its verdict is not about the table in force.
+        Judged figures of the last check, in its order; none if it did not check the table in force.
     verified : VerifiedBy
         Which measurement verified the table in force, or since when none has.
     next_due_utc, next_recipe : str

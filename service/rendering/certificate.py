@@ -56,9 +56,9 @@ def document_dcc(document: Document) -> str:
         Issuer or dates of the measurement are unknown, there is no figure, or a unit has no name in D-SI.
     """
     if document.issuer is None:
-        raise FileFormatError("a digital certificate names its laboratory", "write [issuer] into the machine file")
+        raise FileFormatError("a digital certificate needs the name of its laboratory", "write [issuer] into the machine file")
     if document.days is None:
-        raise FileFormatError("a digital certificate states when it was measured, which is not on record", "give --measured-on DATE")
+        raise FileFormatError("a digital certificate needs the days of the measurement, which are not on record", "give --measured-on DATE")
     if not document.figures:
         raise FileFormatError("a digital certificate needs figures; this report has none", "give a campaign with results")
     root = ET.Element("dcc:digitalCalibrationCertificate", NAMESPACES)

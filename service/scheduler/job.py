@@ -1,4 +1,4 @@
-"""Run a job: watchers follow it, and its begin, its end, and an interruption by the end of the service are recorded.
+"""Run a job, report its progress to watchers, and record its begin, its end, or that the service stopped during it.
 
 Checks, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
 """
@@ -175,7 +175,7 @@ def failure(error: Exception) -> JobOutcome:
 
 @dataclass(frozen=True, slots=True)
 class CheckJobs:
-    """Makes the check of a slot as a job.
+    """Runs the check of a slot as a job.
 
     Parameters
     ----------

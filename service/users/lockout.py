@@ -88,7 +88,7 @@ class Lockout:
         return self.wait_s(account, origin)
 
     def succeeded(self, account: str, origin: LoginOrigin) -> None:
-        """Clear the failures of this account at this place and remember the address. The caller has counted the attempt as failed."""
+        """Clear the failures of this account at this place and remember the address. Call it after counting the attempt as failed."""
         for rule in self._rules(account, origin):
             count = self._counts.get(rule.key)
             if rule.key[0]:

@@ -67,7 +67,7 @@ class Reduction:
 
 @dataclass(frozen=True, slots=True)
 class Way:
-    """One evaluation of a test: how it is called, the uncertainty that repeats do not show, and what is taken off before."""
+    """One evaluation of a test: its name, the uncertainty that repeats do not show, and what is subtracted first."""
 
     text: str
     method: str

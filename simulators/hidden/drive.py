@@ -57,7 +57,7 @@ def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("cyclic_error")
 def cyclic_error(e: Hidden, track: Track, out: Bend) -> None:
-    """The axis errs in waves of the screw's pitch and half of it; if ``e.wild``, they vary along the screw, with a third harmonic."""
+    """Add waves with the screw's pitch and half of it to an axis; if ``e.wild``, they vary along the screw and have a third harmonic."""
     a = e.axis
     x, place = track.q_mm[:, a], middle(track, a)
     angle = 2.0 * np.pi * x / e["pitch_mm"] + e.freedom(0.2, 1.0, 1, signed=True) * np.sin(2.0 * place + e.freedom(0.0, 6.0, 2))

@@ -51,7 +51,7 @@ def init(  # noqa: PLR0913 - one option for each question
     from abbe.service.rendering.page_file import write_page
 
     if file.exists():
-        raise ConfigError(f"{file} exists", "give the name of a new file, or change it with an editor")
+        raise ConfigError(f"{file} exists", "give the name of a new file, or edit the existing one")
     ports = sorted(str(path) for path in SERIAL_PORTS.glob("*"))
     doc: dict[str, Any] = {
         "name": _asked(name, "name of the machine", "mill-1", str, "--name"),

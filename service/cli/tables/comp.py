@@ -51,7 +51,7 @@ StepOption = Annotated[
 
 @comp.command("formats")
 def list_formats(as_json: JsonOption = False) -> None:
-    """List formats and controls: what each can hold, and how its sign is known."""
+    """List formats and controls: what each can hold, and how the sign of its values is known."""
     from abbe.service.formats.controls import CONTROLS
     from abbe.service.formats.registry import FORMATS
 

@@ -203,7 +203,7 @@ def test_a_laser_file_becomes_a_certificate_and_a_file_for_statistics(abbe: Abbe
     issuer = '[issuer]\nlaboratory = "Plant 2"\ncity = "Bonn"\ncountry = "DE"\nperson = "A. B."\n'
     Path("mill.toml").write_text(MACHINE_FILE + issuer)
     abbe("import", "x.rtl", "--yes", "--machine", "mill.toml")
-    assert "when it was measured, which is not on record" in abbe.fails("report", "x", "--machine", "mill.toml", "--out", "x.xml")
+    assert "the days of the measurement, which are not on record" in abbe.fails("report", "x", "--machine", "mill.toml", "--out", "x.xml")
     assert "--measured-on is '22.11.2026', expected a day" in abbe.fails(
         "report", "x", "--machine", "mill.toml", "--measured-on", "22.11.2026"
     )

@@ -89,9 +89,9 @@ def test_a_compensation_report_says_its_unit_or_is_asked(folder: Folder) -> None
 def test_what_is_wrong_in_a_ren(folder: Folder) -> None:
     assert folder.refused("x.REN", REN.replace("3       100", "4       100")).startswith("x.REN:12: the number is '4', expected 3")
     assert folder.refused("x.REN", REN.replace("100.000   ", "101.000   ")).startswith(
-        "x.REN:12: 4 positions do not go from 0 to 150 in steps of 50"
+        "x.REN:12: expected 4 positions from 0 to 150 in steps of 50"
     )
-    assert folder.refused("x.REN", REN[: REN.index("4       150")]).startswith("x.REN:12: 3 positions do not go from 0 to 150")
+    assert folder.refused("x.REN", REN[: REN.index("4       150")]).startswith("x.REN:12: expected 3 positions from 0 to 150")
     assert folder.refused("x.REN", REN.replace("-3.0", "")).startswith("x.REN:12: 2 values, expected number, position and value")
 
 

@@ -174,7 +174,7 @@ def test_every_unit_has_a_name_that_the_validators_accept(validators: Validators
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"issuer": None}, r"names its laboratory - write \[issuer\] into the machine file"),
+        ({"issuer": None}, r"needs the name of its laboratory - write \[issuer\] into the machine file"),
         ({"days": None}, "not on record - give --measured-on DATE"),
         ({"figures": []}, "needs figures"),
         ({"figures": [ReportFigure("g", "s", "n", 1.0, None, "furlong")]}, "the unit 'furlong' of s has no name in D-SI"),
