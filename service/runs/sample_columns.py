@@ -12,14 +12,14 @@ rates with less uncertainty than the edges, it is taken from them.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from abbe.drivers.api import BarSample, bar_is_valid, beam_is_gone, on_path
+from abbe.drivers.api import bar_is_valid, beam_is_gone, on_path
 from abbe.models.alignment.clock import LEAST_PAIRS, ClockFit, across, breaks, fit_clock, relative_rate
 from abbe.models.arrays import F1
 from abbe.service.domain.document import Doc
@@ -130,29 +130,45 @@ Array = npt.NDArray[np.float64]
 DURATION_TOLERANCE = 0.01
 
 
-def sync_edges(samples: Sequence[BarSample], start: RunStart) -> Edges | None:
+BAR_SAMPLE = np.dtype([("seq", "<u4"), ("device_us", "<u8"), ("reading_nm", "<i4"), ("status", "<u2")])
+"""A ball-bar sample as its chunk holds it; fields of `abbe.drivers.api.BarSample`."""
+BarSamples = npt.NDArray[np.void]
+
+
+def _holds(samples: BarSamples, what: Callable[[int], bool]) -> npt.NDArray[np.bool_]:
+    """Mask of the samples for whose status something holds; a run has few different ones."""
+    kinds, which = np.unique(samples["status"], return_inverse=True)
+    return np.array([what(int(kind)) for kind in kinds], dtype=np.bool_)[which]
+
+
+def _follows(samples: BarSamples, k: int) -> bool:
+    """Whether sample ``k`` came directly after the one before it."""
+    return 0 < k < len(samples) and int(samples["seq"][k - 1]) + 1 == int(samples["seq"][k])
+
+
+def sync_edges(samples: BarSamples, start: RunStart) -> Edges | None:
     """Return the edges of the sync line in a run; None if no sample has it set."""
-    at = [k for k, sample in enumerate(samples) if on_path(sample.status)]
-    if not at:
+    at = np.flatnonzero(_holds(samples, on_path))
+    if not at.size:
         return None
-    first, last = at[0], at[-1]
-    begins = first > 0 and samples[first - 1].seq + 1 == samples[first].seq
-    ends = last + 1 < len(samples) and samples[last].seq + 1 == samples[last + 1].seq
-    return Edges(samples[first].device_us, samples[last].device_us, 1.0 / start.rate_hz, begins and ends)
+    first, last = int(at[0]), int(at[-1])
+    device_us, whole = samples["device_us"], _follows(samples, first) and _follows(samples, last + 1)
+    return Edges(int(device_us[first]), int(device_us[last]), 1.0 / start.rate_hz, whole)
 
 
-def starts_in_stream(samples: Sequence[BarSample]) -> bool:
+def starts_in_stream(samples: BarSamples) -> bool:
     """Whether the stream contains the sample just before the path. Then the path's start is known to one sample period."""
-    first = next((k for k, sample in enumerate(samples) if on_path(sample.status)), 0)
-    return first > 0 and (samples[first - 1].seq + 1) % 2**32 == samples[first].seq
+    at = np.flatnonzero(_holds(samples, on_path))
+    first = int(at[0]) if at.size else 0
+    return first > 0 and (int(samples["seq"][first - 1]) + 1) % 2**32 == int(samples["seq"][first])
 
 
-def bar_columns(samples: Sequence[BarSample], start: RunStart, end: RunEnd, *, complete: bool = True, rate: float = 1.0) -> Columns:
+def bar_columns(samples: BarSamples, start: RunStart, end: RunEnd, *, complete: bool = True, rate: float = 1.0) -> Columns:
     """Turn the samples of one path into columns.
 
     Parameters
     ----------
-    samples : sequence of BarSample
+    samples : array of `BAR_SAMPLE`, shape (n,)
         All samples of the run, also those before and after the path.
     start : RunStart
         Its start document, with the path.
@@ -174,26 +190,26 @@ def bar_columns(samples: Sequence[BarSample], start: RunStart, end: RunEnd, *, c
         No sample lies on the path, or feed, path and duration contradict each other.
     """
     path, rate_hz, feed_mm_s = start.commanded, start.rate_hz, start.commanded.feed_mm_s
-    along = [sample for sample in samples if on_path(sample.status)]
-    device_us = np.array([sample.device_us for sample in along], dtype=np.int64)
+    at = np.flatnonzero(_holds(samples, on_path))
+    device_us = samples["device_us"][at].astype(np.int64)
     path_us = end.path_us if complete else None
     if path_us is not None:
         _check_durations(device_us, path_us, float(path.arc_mm[-1]) / feed_mm_s, rate_hz)
-    along_s = _time_along_path(samples, along, device_us, path_us, (rate_hz, rate))
+    along_s = _time_along_path(samples, at, device_us, path_us, (rate_hz, rate))
     counts = _counts(path, feed_mm_s * along_s)
-    along, device_us, along_s = [s for s, yes in zip(along, counts, strict=True) if yes], device_us[counts], along_s[counts]
+    along, device_us, along_s = samples[at[counts]], device_us[counts], along_s[counts]
     count = len(along)
     return Columns(
         t_s=_start_s(start, end) + along_s,
         q_mm=_position(path.points_mm, feed_mm_s * along_s),
         feed_mm_min=np.full(count, path.feed_mm_min),
         direction=np.full(count, float(path.direction)),
-        deviation_mm=np.array([sample.reading_nm * 1e-6 for sample in along], dtype=np.float64),
-        valid=np.array([bar_is_valid(sample.status) for sample in along], dtype=np.bool_),
+        deviation_mm=along["reading_nm"] * 1e-6,
+        valid=_holds(along, bar_is_valid),
         further={
-            "device_seq": np.array([sample.seq for sample in along], dtype=np.int64),
+            "device_seq": along["seq"].astype(np.int64),
             "device_us": device_us,
-            "status": np.array([sample.status for sample in along], dtype=np.int64),
+            "status": along["status"].astype(np.int64),
         },
     )
 
@@ -207,18 +223,19 @@ def _start_s(start: RunStart, end: RunEnd) -> float:
 
 
 def _time_along_path(
-    samples: Sequence[BarSample],
-    along: Sequence[BarSample],
+    samples: BarSamples,
+    at: npt.NDArray[np.intp],
     device_us: npt.NDArray[np.int64],
     path_us: tuple[int, int] | None,
     rates: tuple[float, float],
 ) -> Array:
-    if not along:
+    if not at.size:
         return np.zeros(0)
     half_period_s = 0.5 / rates[0]
     since_first_s = (device_us - device_us[0]) * 1e-6 * rates[1]
-    first = samples.index(along[0])
-    start_was_lost = along[0].seq != (samples[first - 1].seq + 1) % 2**32 if first else along[0].seq != 0
+    first = int(at[0])
+    seq, before = int(samples["seq"][first]), int(samples["seq"][first - 1])
+    start_was_lost = seq != (before + 1) % 2**32 if first else seq != 0
     if start_was_lost and path_us is not None:
         # The first edge fell into a gap of the stream: use the other edge of the path.
         duration_s = (path_us[1] - path_us[0]) * 1e-6

@@ -1,0 +1,134 @@
+"""How soon the page draws, and how smoothly it zooms: a run of a million readings and the trend of a year, in a real Chromium.
+
+    python -m tests.experiments.campaigns.plots                 # prints the figures with the load of this computer
+    taskset -c 0 python -m tests.experiments.campaigns.plots    # server and browser share one core
+
+First: from the start of the navigation until the curve stands, the first time (the service reads the run from its database) and again.
+Zoom: frames a second while every frame zooms a little; and the longest frame.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import statistics
+import tempfile
+import zlib
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import numpy as np
+from playwright.sync_api import Page
+
+from abbe.service.domain.schedule import Schedule
+from abbe.service.runs.columns import BAR_CODEC
+from abbe.service.storage.store import Store
+from abbe.service.verification import verify
+from abbe.service.web.login.authentication import COOKIE
+from tests.pages_world import Filled, served
+from tests.service.web.api_bench import MACHINE
+from tests.system.serve_check import Result
+from tests.system.test_serve_page import launched
+
+READINGS, CHUNK = 1_000_000, 50_000
+SAMPLE = np.dtype([("seq", "<u4"), ("device_us", "<u8"), ("reading_nm", "<i4"), ("status", "<u2")])
+ON_PATH, PERIOD_US = 8, 1000
+TURNS = np.linspace(0.0, 40.0 * np.pi, 1801)
+POINTS = [[100.0 * np.cos(a), 100.0 * np.sin(a), 0.0] for a in TURNS]
+SETUP = {"setup_id": "A", "t_set_s": 3.5, "centre_mm": [0.0, 0.0, 0.0], "radius_mm": 100.0, "plane": "XY"}
+DAILY = Schedule("daily", "0 6 * * *", "Europe/Berlin", "quick-check")
+FRAMES = """() => new Promise((done) => {
+  const over = document.querySelector("[data-part=main] .u-over"), times = [];
+  const frame = (now) => {
+    times.push(now);
+    const inward = Math.floor(times.length / 40) % 2 === 0;
+    const at = {deltaY: inward ? -1 : 1, ctrlKey: true, clientX: over.getBoundingClientRect().left + 400,
+                bubbles: true, cancelable: true};
+    over.dispatchEvent(new WheelEvent("wheel", at));
+    if (times.length < 240) requestAnimationFrame(frame); else done(times);
+  };
+  requestAnimationFrame(frame);
+})"""
+PLOTTED = "() => document.documentElement.dataset.plotted && document.querySelector('[data-part=main] canvas') && performance.now()"
+
+
+def fill(folder: Path, checks: int) -> Filled:
+    """A store with one long run and a history of daily checks."""
+    url = f"sqlite:///{folder / 'abbe.sqlite3'}"
+    with Store.open(url) as store:
+        machine = store.machines.add("mill-7", MACHINE)
+        length_mm = float(np.linalg.norm(np.diff(np.array(POINTS), axis=0), axis=1).sum())
+        feed_mm_min = length_mm / (READINGS * PERIOD_US * 1e-6) * 60.0
+        path = {"feed_mm_min": feed_mm_min, "direction": 1, "points_mm": POINTS}
+        start = {"setup": SETUP, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": 1000}
+        run = store.runs.start(store.campaigns.add(machine, "long", {}), "r01", "ballbar_circle", "identify", start)
+        _samples(store, run)
+        store.runs.finish(run, "complete", "", {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + READINGS * PERIOD_US})
+        now = datetime.now(UTC)
+        noise = np.random.default_rng(1).normal(0.0, 0.4, (checks, 2))
+        for day in range(checks):
+            at = now - timedelta(days=checks - day)
+            values = {"body_diagonal_um": 12.0 + noise[day, 0] + 0.01 * day, "helix_rms_um": 2.0 + 0.3 * noise[day, 1]}
+            told = Result("pass", values, text="pass", started_utc=at, duration_s=180.0, campaign=f"quick-check {day}")
+            store.verifications.add_with_messages(machine, verify.check_doc(verify.Occasion("mill-7", DAILY, at), told), [])
+    return Filled(url, "mill-7", [DAILY], {}, "long", 0, [], 0)
+
+
+def _samples(store: Store, run: int) -> None:
+    k = np.arange(-20, READINGS + 20)
+    samples = np.zeros(k.size, SAMPLE)
+    samples["seq"], samples["device_us"] = np.arange(k.size), 10**9 + np.arange(k.size) * PERIOD_US
+    rng = np.random.default_rng(2)
+    samples["reading_nm"] = 4000.0 * np.sin(k * 2e-5) + rng.normal(0.0, 300.0, k.size)
+    samples["status"] = np.where((k >= 0) & (k < READINGS), ON_PATH, 0)
+    for number, at in enumerate(range(0, k.size, CHUNK)):
+        part = samples[at : at + CHUNK]
+        payload = zlib.compress(part.tobytes(), 1)
+        first, last = int(part["device_us"][0]), int(part["device_us"][-1])
+        store.chunks.append(run, "bar", number, part.size, BAR_CODEC, payload, 0.0, 0.0, first, last)
+
+
+def first_ms(page: Page, address: str) -> float:
+    """Time from the start of a navigation until the curve stands, ms."""
+    page.goto(address, wait_until="commit")
+    return float(page.wait_for_function(PLOTTED, timeout=120_000, polling="raf").json_value())
+
+
+def frames(page: Page) -> tuple[float, float]:
+    """Frames a second and the longest frame, ms, while every frame zooms."""
+    steps = np.diff(page.evaluate(FRAMES))
+    return 1e3 / float(np.mean(steps)), float(np.max(steps))
+
+
+def weight_kb(page: Page, address: str) -> float:
+    """What a screen and its parts weigh without a cache, kB."""
+    sizes: list[int] = []
+    page.on("response", lambda answer: sizes.append(len(answer.body())))
+    page.goto(address, wait_until="networkidle")
+    return sum(sizes) / 1e3
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--checks", type=int, default=365, help="daily checks in the trend")
+    parser.add_argument("--repeat", type=int, default=5)
+    given = parser.parse_args()
+    print(f"load {os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} of {os.cpu_count()} cores")  # noqa: T201
+    with tempfile.TemporaryDirectory() as folder, served(fill(Path(folder), given.checks)) as one, launched() as chromium:
+        for name, path in (("a million readings", "/run?id=1"), (f"trend of {given.checks} checks", "/trends")):
+            made = chromium.new_context(viewport={"width": 1280, "height": 800}, service_workers="block")
+            made.add_cookies([{"name": COOKIE, "value": one.people.begin(one.people.get("vera")), "url": one.base}])
+            page = made.new_page()
+            cold, *warm = (first_ms(page, one.base + path) for _ in range(1 + given.repeat))
+            found = [frames(page) for _ in range(given.repeat)]
+            rate, longest = statistics.median(f for f, _ in found), max(ms for _, ms in found)
+            heavy = weight_kb(made.new_page(), one.base + path)
+            said = f"first {cold:.0f} ms, again {statistics.median(warm):.0f} ms (median of {len(warm)}, at most {max(warm):.0f})"
+            zoomed = f"zoom {rate:.0f} frames/s (median of {len(found)} times 240), longest {longest:.0f} ms"
+            print(f"{name}: {said}; {zoomed}; {heavy:.0f} kB")  # noqa: T201
+            made.close()
+
+
+if __name__ == "__main__":
+    main()
