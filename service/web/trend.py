@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta, tzinfo
 from html import escape
+from itertools import pairwise
 
 from abbe.service.web.formatting import number
 
@@ -123,7 +124,11 @@ def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]
     known = [(x(point.at.timestamp()), y(point.limit)) for point in points if point.limit is not None]
     if not known:
         return []
-    path = f"M{LEFT} {known[0][1]:.1f}" + "".join(f"H{px:.1f}V{py:.1f}" for px, py in known) + f"H{WIDTH - RIGHT}"
+    path = (
+        f"M{LEFT} {known[0][1]:.1f}"
+        + "".join(f"H{px:.1f}V{py:.1f}" for (_, before), (px, py) in pairwise(known) if py != before)
+        + f"H{WIDTH - RIGHT}"
+    )
     last_y = known[-1][1]
     return [
         f'<path class="limit" d="{path}"/>',

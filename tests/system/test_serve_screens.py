@@ -511,3 +511,17 @@ def test_the_map_without_3d_is_a_slice_and_a_table(chromium, running, axe) -> No
         assert page.locator(".nodes tbody tr").count() == 216
         assert violations(page, axe, "{}") == []
         assert watch.errors == []
+
+
+def test_the_report_of_a_long_run_comes_after_its_curve(chromium, running, monkeypatch) -> None:
+    monkeypatch.setattr("abbe.service.web.pages.routes.LONG_RUN", 10)
+    with context(chromium) as made:
+        page = made.new_page()
+        watch = Watch(page, running.base)
+        log_in(page, running.base, "anna")
+        page.goto(f"{running.base}/run?id=1")
+        assert page.locator("#run-report[aria-busy] a[href='/run?id=1&whole=true']").count() == 1, "there is a way without scripts"
+        page.wait_for_selector("[data-run] canvas")
+        page.wait_for_selector("#run-report:not([aria-busy]) svg", timeout=60_000)
+        assert page.evaluate(INSIDE)
+        assert watch.errors == []

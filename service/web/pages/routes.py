@@ -31,7 +31,7 @@ from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, propo
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
 from abbe.service.web.pages.run_curve import NOTHING, run_curve
-from abbe.service.web.pages.runs import STATES, TESTS, RunsQuery, run_list, run_screen
+from abbe.service.web.pages.runs import LONG_RUN, STATES, TESTS, RunsQuery, readings_of, run_list, run_screen, shell_of
 from abbe.service.web.problems import problem
 
 _DARK = re.compile(r"@media screen and \(prefers-color-scheme:dark\)\{:root\{([^}]*)\}\}")
@@ -83,16 +83,20 @@ def _add_runs(app: FastAPI, context: PageContext) -> None:
 
     @app.get("/run", include_in_schema=False)
     @needs(Permission.READ)
-    async def run(id: Number = None) -> HTMLResponse:
+    async def run(id: Number = None, whole: bool = False) -> HTMLResponse:
         if id is None:
             newest, _ = await context.read(measured.runs, context.reader, {}, None, 1)
             id = newest[0].number if newest else None
         record = None if id is None else await context.read(find_or_none, context.store.runs.find, id)
         if record is None and id is not None:
             return await context.missing("run", id)
-        screen = None if record is None else await context.read(run_screen, context.store, record, context.rules)
+        late = record is not None and not whole and await context.read(readings_of, context.store, record.id) > LONG_RUN
+        make = shell_of if late else run_screen
+        screen = None if record is None else await context.read(make, context.store, record, context.rules)
         report = None if screen is None or screen.document is None else shown(screen.document)
-        return await context.show("run.html", screen=screen, report=report, words={"plot.read": current().translate("plot.read")})
+        return await context.show(
+            "run.html", screen=screen, report=report, late=late, words={"plot.read": current().translate("plot.read")}
+        )
 
 
 def _add_run_curve(app: FastAPI, context: PageContext) -> None:

@@ -91,6 +91,20 @@ def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
         return RunScreen(record, None, f"{type(error).__name__}: {error}")
 
 
+LONG_RUN = 100_000
+"""A run of more readings is shown without its report at first: making that takes seconds."""
+
+
+def readings_of(store: Store, number: int) -> int:
+    """How many samples a run has in its database."""
+    return max((channel.samples for channel in store.chunks.channels(number)), default=0)
+
+
+def shell_of(_store: Store, record: RunRecord, _rules: Rules) -> RunScreen:
+    """A run whose report comes later."""
+    return RunScreen(record, None)
+
+
 def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[Run, Document]:
     """A run and its report."""
     owner = store.campaigns.find(record.campaign_id)

@@ -308,7 +308,7 @@ class Trend extends Box {
   build() {
     const { told, words } = this;
     const colours = paint();
-    const date = (at) => uPlot.tzDate(new Date(at * 1e3), told.zone);
+    const date = zoned(told.zone);
     const days = (u, splits) => splits.map((at) => {
       const [min, max] = [u.scales.x.min, u.scales.x.max];
       const [, y, m, d, clock] = /(\d{4})-(\d\d)-(\d\d) (\d\d:\d\d)/.exec(stamp(date(at)));
@@ -384,30 +384,51 @@ class Trend extends Box {
   points(u, colours) {
     const { told } = this;
     const r = devicePixelRatio;
-    inside(u, (pen, x, y) => told.x.forEach((at, k) => {
-      const [px, py] = [x(at), y(told.y[k])];
-      const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
-      pen.globalAlpha = told.earlier[k] ? 0.5 : 1;
-      if (told.u[k]) for (const part of [[[px, top], [px, bottom]], [[px - 4 * r, top], [px + 4 * r, top]], [[px - 4 * r, bottom], [px + 4 * r, bottom]]]) line(pen, part, colours.quiet, { width: 1.2 });
-      const word = VERDICTS[told.verdict[k]];
-      const colour = told.earlier[k] ? colours.quiet : word === "pass" ? colours.pass : word === "fail" ? colours.fail : colours.unclear;
-      if (word === "fail") {
-        line(pen, [[px - 5 * r, py - 5 * r], [px + 5 * r, py + 5 * r]], colour, { width: 2.5 });
-        line(pen, [[px - 5 * r, py + 5 * r], [px + 5 * r, py - 5 * r]], colour, { width: 2.5 });
-      } else {
-        pen.beginPath();
-        if (word === "pass") pen.arc(px, py, 4 * r, 0, 2 * Math.PI);
-        else for (const [dx, dy] of [[0, -5], [5, 0], [0, 5], [-5, 0]]) pen.lineTo(px + dx * r, py + dy * r);
-        pen.closePath();
-        pen.fillStyle = colour;
-        pen.fill();
+    const { min, max } = u.scales.x;
+    inside(u, (pen, x, y) => {
+      // One path for all points that look alike: strokes one by one would be too slow for the points of years.
+      const looks = new Map();
+      const of = (word, earlier) => {
+        const name = `${word} ${earlier}`;
+        if (!looks.has(name)) looks.set(name, { word, earlier, bars: new Path2D(), marks: new Path2D() });
+        return looks.get(name);
+      };
+      told.x.forEach((at, k) => {
+        if (at < min || at > max) return;
+        const { word, bars, marks } = of(VERDICTS[told.verdict[k]], told.earlier[k]);
+        const [px, py] = [x(at), y(told.y[k])];
+        if (told.u[k]) {
+          const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
+          for (const [ax, ay, bx, by] of [[0, top, 0, bottom], [-4 * r, top, 4 * r, top], [-4 * r, bottom, 4 * r, bottom]]) {
+            bars.moveTo(px + ax, ay);
+            bars.lineTo(px + bx, by);
+          }
+        }
+        if (word === "pass") {
+          marks.moveTo(px + 4 * r, py);
+          marks.arc(px, py, 4 * r, 0, 2 * Math.PI);
+        } else {
+          const corners = word === "fail" ? [[-5, -5], [5, 5], null, [-5, 5], [5, -5]] : [[0, -5], [5, 0], [0, 5], [-5, 0], [0, -5]];
+          corners.forEach((one, c) => one && marks[c === 0 || !corners[c - 1] ? "moveTo" : "lineTo"](px + one[0] * r, py + one[1] * r));
+        }
+      });
+      for (const { word, earlier, bars, marks } of looks.values()) {
+        const colour = earlier ? colours.quiet : word === "pass" ? colours.pass : word === "fail" ? colours.fail : colours.unclear;
+        pen.globalAlpha = earlier ? 0.5 : 1;
+        pen.strokeStyle = colours.quiet;
+        pen.lineWidth = 1.2 * r;
+        pen.stroke(bars);
+        pen.strokeStyle = pen.fillStyle = colour;
+        pen.lineWidth = 2.5 * r;
+        if (word === "fail") pen.stroke(marks);
+        else pen.fill(marks);
       }
       pen.globalAlpha = 1;
-    }));
+    });
   }
 
   when(at) {
-    return stamp(uPlot.tzDate(new Date(at * 1e3), this.told.zone));
+    return stamp(zoned(this.told.zone)(at));
   }
 
   say(k) {
@@ -437,7 +458,22 @@ class Trend extends Box {
   }
 }
 
-// A date that `tzDate` shifted to the zone, as on the other screens.
+// Times in s since 1970 as dates that are shifted to a zone. One formatter for all: uPlot's own makes one for each tick of each frame.
+const zones = new Map();
+
+function zoned(zone) {
+  if (!zones.has(zone)) {
+    const parts = { year: "numeric", month: "numeric", day: "numeric", hour: "numeric", minute: "numeric", second: "numeric" };
+    const format = new Intl.DateTimeFormat("en-US", { ...parts, timeZone: zone, hourCycle: "h23" });
+    zones.set(zone, (at) => {
+      const of = Object.fromEntries(format.formatToParts(at * 1e3).map(({ type, value }) => [type, Number(value)]));
+      return new Date(of.year, of.month - 1, of.day, of.hour, of.minute, of.second);
+    });
+  }
+  return zones.get(zone);
+}
+
+// A date that was shifted to the zone, as on the other screens.
 function stamp(date) {
   const two = (n) => String(n).padStart(2, "0");
   return `${date.getFullYear()}-${two(date.getMonth() + 1)}-${two(date.getDate())} ${two(date.getHours())}:${two(date.getMinutes())}`;
