@@ -89,7 +89,7 @@ class Readiness(Protocol):
         ...
 
     async def watch(self) -> None:
-        """Observe forever what must be known over time, or return at once."""
+        """Record the machine's state without end, for preconditions that need its history; return at once if there is none."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""Interprets the steps of one test on real devices. Motion never outlives the block that commanded it."""
+"""Interprets the steps of one test on real devices. All motion ends with the block of code that commanded it."""
 
 from __future__ import annotations
 

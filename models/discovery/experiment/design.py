@@ -67,7 +67,7 @@ class Prospect:
 
     @property
     def gain(self) -> F1:
-        """Sigmas that the addition adds, for each rival."""
+        """Separation that the addition gains from each rival, in sigmas."""
         return np.asarray(self.sigmas - self.already)
 
     @property

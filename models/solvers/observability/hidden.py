@@ -242,7 +242,7 @@ class HiddenGroup:
     vectors : array, shape (p, count)
         All combinations, coefficients in their own units.
     harmless : bool
-        Whether the combinations move none of the tools used anywhere in the volume (another tool they would).
+        Whether the combinations move none of the tools used anywhere in the volume (they would move another tool).
     effect_mm : float
         Rms deviation that a typical machine may hide here, at the worst point, rigid motion removed, mm; 0 if harmless.
     cause, cures, text

@@ -196,9 +196,9 @@ def duties_on(
 
 
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
-    """Return a function that makes, from the service's store, the orders for tables.
+    """Return a function that takes the service's store and returns what a person may order for tables: rollback and push.
 
-    A push is among them only if the service never pushes by itself.
+    A push can be ordered only if the service never pushes by itself.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved

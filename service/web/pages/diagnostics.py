@@ -132,7 +132,7 @@ def config_of(sources: Sources, status: Status, broker: str) -> dict[str, Any]:
 
 
 def bundle(diagnosis: Diagnosis, config: Mapping[str, Any], status: Status, log: Sequence[str]) -> bytes:
-    """The support bundle as a zip file; every member is blanked."""
+    """The support bundle as a zip file. Secrets in its files are blanked."""
     members = {
         "config.json": _json(config),
         "diagnosis.json": _json(asdict(diagnosis)),
