@@ -104,7 +104,7 @@ class Shift:
 class Fit:
     """Fit of one time constant; ``since_start``: to changes of temperature since the start of each run.
 
-    ``mean``, ``covariance``: of 2 sensors sensitivities, the displacement at 20 degrees C, and a shift.
+    ``mean``, ``covariance``: of two sensitivities for each sensor, the displacement at 20 degrees C, and a shift.
     """
 
     since_start: bool

@@ -1,1 +1,1 @@
-"""Domain records of the service: one for each idea, used from the core over the channel to page, JSON, OPC UA and MTConnect."""
+"""Domain records of the service, one for each concept. Core, channel, page, JSON, OPC UA and MTConnect all use the same records."""

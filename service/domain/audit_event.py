@@ -39,7 +39,7 @@ class AuditEvent(AuditEntry):
     """A complete event as it is stored.
 
     ``doc``: options and reasons, no secrets; ``prev``: digest of the previous event; ``key``, ``mac``: name of the secret key, and the
-    message authentication code that it gives the digest.
+    message authentication code of the digest with this key.
     """
 
     doc: Doc = field(default_factory=dict)

@@ -307,7 +307,7 @@ SEALS = 2
 class Image:
     """An image to stage. ``gen``: generation when writing was permitted. ``in_force``: CRC of the table that stays active.
 
-    ``semantic_digest``: empty for bytes that the control itself held, whose meaning is proved by their being the same.
+    ``semantic_digest``: empty for bytes that the control itself held: equal bytes have the same meaning.
     """
 
     bank: int

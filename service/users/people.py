@@ -280,7 +280,7 @@ class UserAccounts:
     def device_of(self, name: str, cookie: str) -> str:
         """Id of a browser, if this user has logged in with it since the password was set; else empty.
 
-        The cookie is not stored: its seal is keyed with the hash of the user's password, which never leaves the database.
+        The cookie is not stored. The key of its seal is the hash of the user's password; this hash never leaves the database.
         """
         label, _, seal = cookie.partition(".")
         user = self._store.people.find(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
