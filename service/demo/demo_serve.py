@@ -91,7 +91,7 @@ async def run_served_demo(seed: int, speed: float, folder: Path, port: int, show
 
 
 async def measured_limits(session: Session, store: Store, site: Site, rate_hz: int) -> dict[str, float]:
-    """Measure the machine and return limits, µm, above its figures plus U by the small margins `MARGIN_UM`."""
+    """Measure the machine and return limits, µm: figure plus U plus the small margin in `MARGIN_UM`."""
     plan = paced(verification(site.machine, rate_hz=rate_hz, name="as it is"), site.max_feed_mm_min)
     ids = await measure(session, store, site, plan, progress=ignore_progress)
     rows = figure_rows(figures(await load_runs(store, ids)))

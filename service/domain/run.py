@@ -287,7 +287,7 @@ class ArtefactSetup(Setup):
 
     @property
     def place_mm(self) -> F1:
-        """Axis position of its zero."""
+        """Axis position of the artefact's zero, mm."""
         return self.pose.origin_mm
 
     @property

@@ -100,7 +100,7 @@ def digest(data: bytes) -> str:
 
 
 def text_file(name: str, data: bytes) -> TextFile:
-    """Decode a text file: UTF-8, UTF-16 with its mark, GB 2312 if all bytes above 127 are pairs of usual signs, else Latin-1.
+    """Decode a text file: UTF-8, UTF-16 with byte order mark, GB 2312 if all bytes above 127 are pairs of usual signs, else Latin-1.
 
     Raises
     ------

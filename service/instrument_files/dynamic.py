@@ -1,4 +1,6 @@
-"""Renishaw .rtx: samples of a displacement at a constant rate, text in front and binary behind (one public reader, one real header).
+"""Renishaw .rtx: samples of a displacement at a constant rate; a header of text, then binary data.
+
+The format is known from one public reader and one real header.
 
 The file does not state the unit of the samples, nor where the axis was at each of them: both are asked.
 """

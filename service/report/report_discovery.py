@@ -192,7 +192,8 @@ def _card(effect: EffectFound) -> dict[str, str]:
 def gap_table(finding: Finding) -> TextTable:
     """Return the table of the gap (measured minus simulated), one row per role of runs.
 
-    Fitted runs get no closed share, because a fit makes their residuals smaller than those of new runs. Sealed runs are only counted: their readings are unknown here.
+    Fitted runs get no closed share, because a fit makes their residuals smaller than those of new runs.
+    Sealed runs are only counted: their readings are unknown here.
     """
     only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap
     by = "" if finding.effects or not _what(finding) else f" by {_what(finding)}"

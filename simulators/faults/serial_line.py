@@ -152,7 +152,7 @@ class FaultyLine:
         return 0 if self._terminal is None else max(0, BUFFER_BYTES - self._terminal.backlog)
 
     def send(self, data: bytes) -> None:
-        """Send bytes to the host, as ``spoil`` and wrong settings of the host change them."""
+        """Send bytes to the host, after ``spoil`` and the effect of wrong settings of the host."""
         if self._terminal is None or not data:
             return
         for piece in self.spoil(data) if self.spoil is not None else (data,):
