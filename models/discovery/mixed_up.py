@@ -81,7 +81,7 @@ def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]
 def wrong_tool(problem: WhitenedProblem) -> MixedUp | None:
     """Find the tool that explains most of the misfit if one component of its vector changes sign; None without one, or with a single tool.
 
-    Two tools that explain it equally are both named: reversing both, and the rotations, gives the same readings.
+    If two tools explain it equally, both are named: reversed tool vectors with reversed rotations give the same readings.
     ``problem``: as for `mixed_up`. Every tool and component is tried by a new fit of the simulation.
     """
     tools = {_tool(p) for p in problem.paths}

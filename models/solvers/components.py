@@ -88,7 +88,7 @@ class InformationSums:
         return InformationSums(gram, self.rhs @ root, self.square, self.count)
 
     def decimated(self, factor: F1) -> InformationSums:
-        """The sums with fewer effective readings by ``factor``, shape (k,), because neighbours are correlated."""
+        """The sums divided by ``factor``, shape (k,): correlated neighbours count as fewer readings."""
         f: F1 = 1.0 / factor
         return InformationSums(self.gram * f[:, None, None], self.rhs * f[:, None], self.square * f, self.count * f)
 

@@ -276,7 +276,8 @@ class AuditBook:
             append_line(self.head_file, f"{anchor.id} {anchor.digest} {anchor.mac}")
         except OSError as error:
             raise AuditBroken(
-                refusal(self.head_file, error).detail, "the record is in the database, but its head is not kept; make the file writable"
+                refusal(self.head_file, error).detail,
+                "the record is in the database, but not its line in the file of heads; make the file writable",
             ) from None
 
 
