@@ -277,7 +277,7 @@ class AuditBook:
         except OSError as error:
             raise AuditBroken(
                 refusal(self.head_file, error).detail,
-                "the record is in the database, but not its line in the file of heads; make the file writable",
+                "the record is in the database, but this file lacks its head; make the file writable",
             ) from None
 
 
