@@ -246,7 +246,7 @@ def test_trace_position_and_stop_are_seen_together_on_every_screen_and_then_the_
             page.wait_for_function("() => Number(document.getElementById('dro-feed').textContent) > 100")
             assert page.inner_text("#dro-door") == "shut"
             assert re.search(r"\d+ (s|min) left", page.inner_text("#live-left")), "the dry run knows"
-            assert faults(page, axe, CONTRAST) == []
+            assert faults(page, axe) == []
             shot(page, f"serve-live-{size}-{scheme}.png")
         page.wait_for_selector("#live-pair.single:not(.old)", timeout=90_000)
         page.wait_for_function("() => document.getElementById('strip-scale').textContent.startsWith('60 s')")

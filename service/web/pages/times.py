@@ -26,7 +26,8 @@ from abbe.service.web.pages.context import zone_of
 from abbe.service.web.trend import Point
 from abbe.service.web.units import converted
 
-CHECKS = 300
+CHECKS = 366
+"""Number of latest checks in a trend: a year of daily ones."""
 SLOTS = 30
 AUDIT_ROWS = 200
 PLOT_WORDS = ("check.open", "plot.at", "plot.share", "verdict.cannot tell", "verdict.fail", "verdict.pass")
