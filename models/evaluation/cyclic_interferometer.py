@@ -102,7 +102,7 @@ def from_quadrature(x: F1, y: F1, fringe: float) -> CyclicError:
 
 
 def from_linear_run(reading: F1, deviation: F1, fringe: float) -> CyclicError:
-    """Fit waves of the interferometer's own ``reading`` (n,) to its ``deviation`` (n,) from a reference, beside a smooth trend; one unit.
+    """Fit waves of an interferometer's ``reading`` (n,), and a smooth trend, to its ``deviation`` (n,) from a reference, same unit.
 
     Raises
     ------

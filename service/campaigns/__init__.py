@@ -1,1 +1,1 @@
-"""Measuring: a recipe becomes runs in the store, complete or visibly not."""
+"""Measure the tests of a recipe and store them as runs; an incomplete run is marked as incomplete."""

@@ -53,7 +53,7 @@ class Track:
 
     @property
     def moving(self) -> bool:
-        """Whether the machine moves during readings: a ball-bar run or the live world of the devices, but no laser run, which dwells."""
+        """Whether the machine moves during readings: true for ball-bar runs and simulated devices, false for laser runs, which dwell."""
         return self.course is not None or self.kind == "live"
 
     @property
