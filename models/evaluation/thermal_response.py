@@ -1,8 +1,8 @@
 """Displacement of a standing spindle or table as the lagged response to temperatures (test at standstill, ISO 230-3).
 
 Every sensor acts twice: at once, and through a first-order lag whose time constant all sensors share, so that each may be fast, slow, or
-fast and later partly reversed. Sensitivities have one normal prior about zero. The scatter has a memory (Ornstein-Uhlenbeck). Priors, noise and
-time constant are those of largest evidence; time constants are averaged by their evidence. A lag starts in equilibrium.
+fast and then partly reversed. Sensitivities have one normal prior about zero. The scatter has a memory (Ornstein-Uhlenbeck). Priors, noise
+and time constant are those of largest evidence; time constants are averaged by their evidence. A lag starts in equilibrium.
 
 There are two models. The first takes absolute temperatures, which also show how the start differs from run to run. The second
 takes the changes since the start of a run, and the reading at the start. In both, each run has an offset, which is not predicted.
