@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from enum import StrEnum
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from abbe.drivers.errors import NotProved
+from abbe.drivers.links.urls import untested_remedy
 
 FORMAT = "abbe-device-test/1"
 
@@ -70,12 +70,6 @@ class TestReport:
         return {"format": FORMAT} | asdict(self)
 
 
-def prove(url: str) -> str:
-    """Return the remedy for a device whose test is missing or out of date."""
-    bare = re.split(r"[?&]tested=", url)[0]
-    return f'run: abbe device test "{bare}" --out report.json, then add {"&" if "?" in bare else "?"}tested=report.json to the URL'
-
-
 def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ability) -> None:
     """Refuse a device whose report does not prove an ability.
 
@@ -95,7 +89,7 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     NotProved
         No report, of another device or file, or without this ability; the message names the checks that failed or are missing.
     """
-    remedy = prove(device)
+    remedy = untested_remedy(device)
     if not path:
         raise NotProved(device, f"open to {needed}", "its sign, scale and freshness are not proved yet", remedy)
     try:

@@ -205,6 +205,12 @@ def split_report(text: str) -> tuple[str, str]:
     return text[: found.start()] + between + text[found.end() :], unquote(found["path"])
 
 
+def untested_remedy(text: str) -> str:
+    """Return the remedy for a device whose test is missing or out of date."""
+    bare = split_report(text)[0]
+    return f'run: abbe device test "{bare}" --out report.json, then add {"&" if "?" in bare else "?"}tested=report.json to the URL'
+
+
 def beside(text: str, folder: Path) -> str:
     """Return a URL whose files (`Description`) are found from any working directory; relative ones lie in ``folder``."""
     if installed(text) is not None:

@@ -11,9 +11,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from abbe.drivers import registry
-from abbe.drivers.described.tested import prove
 from abbe.drivers.errors import DriverError
-from abbe.drivers.links.urls import installed, parse_url, split_report
+from abbe.drivers.links.urls import installed, parse_url, split_report, untested_remedy
 from abbe.service.campaigns.plausibility import check_plausibility, check_sensors
 from abbe.service.config import LoadedMachine
 from abbe.service.devices.session import lock_machine, no_console
@@ -171,7 +170,7 @@ def _answered(role: str, url: str, what: str) -> Examined:
     """Return the line of a device that answers; the driver of a package that no report proves is to be tested first."""
     if installed(url) is None or split_report(url)[1]:
         return Examined(role, "good", f"{url}: {what}")
-    return Examined(role, "look", f"{url}: {what}; its driver is not tested", prove(url))
+    return Examined(role, "look", f"{url}: {what}; its driver is not tested", untested_remedy(url))
 
 
 def _failed(role: str, error: AbbeError | DriverError) -> Examined:
