@@ -144,7 +144,7 @@ def _reported_strange(store: Store, machine: str, journal: JournalView, checks: 
     """Whether the last heartbeat of the machine's service reports a strange table, without a later change of table and without a later
     check that found the expected one.
     """
-    heartbeat = store.heartbeats.all().get(machine)
+    heartbeat = store.heartbeats.of_machine(machine)
     if heartbeat is None or not strange_table(heartbeat.doc.get("attention") or []):
         return False
     heartbeat_utc = datetime.fromisoformat(heartbeat.seen_utc)

@@ -180,6 +180,10 @@ class Heartbeats(Repository):
         """The latest state of each service, by machine."""
         return {one.machine: one for one in self._all(HEARTBEAT, order=heartbeats.c.machine)}
 
+    def of_machine(self, machine: str) -> HeartbeatRecord | None:
+        """The latest state of a machine's service; None if it never ran."""
+        return self._first(HEARTBEAT, heartbeats.c.machine == machine)
+
 
 REPLY_KEPT = timedelta(days=7)
 """How long an answer is stored."""

@@ -213,7 +213,7 @@ def watched(ask: Any) -> None:
     ask.alarms.entries("mill-7"), ask.alarms.entries("MILL-7")
     for name in ("mill-7", "MILL-7", "mill-7"):
         ask.heartbeats.put(name, DOC | {"name": name})
-    ask.heartbeats.all(), ask.machines.names()
+    ask.heartbeats.all(), ask.heartbeats.of_machine(name), ask.machines.names()
     ask.outbox.add_document("a/state", DOC), ask.outbox.add("a/alarm", b"\x00\xff"), ask.outbox.add("a/state", "ü"), ask.outbox.count()
     ask.outbox.done(1), ask.outbox.done(2), ask.outbox.done(77), ask.outbox.prune(1), ask.outbox.pending(2)
     ask.outbox.shed(("a/alarm",), 2, 1, lambda count, first, last: ("a/alarm", f"{count} {first} {last}".encode())), ask.outbox.pending()
