@@ -81,6 +81,7 @@ def test_every_effect_of_the_catalogue_is_told(lang: str) -> None:
     said: set[str] = set(REMEDIES.values())
     for one in catalogue():
         said |= {one.title, one.signature, one.remedy_text, one.source, *(f"{one.title} {key}".strip() for key in one.keys)}
+        said |= {form.name for form in one.forms}
     assert {text: told for text in said if english(lang, told := phrase(lang, text), said)} == {}
 
 
