@@ -144,7 +144,7 @@ def read_backup(folder: Path) -> Backup:
         wanted, found = listed.files, file_list(folder)
         wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
         if not wrong and (listed.pieces is not None or (folder / PIECES).exists()):
-            check(folder / PIECES, [] if listed.pieces is None else listed.pieces.names)
+            check(folder / PIECES, listed.pieces or ListedPieces(0, 0, []))
     except FileNotFoundError:
         raise BackupRefused(f"{folder} is not a backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
     except OSError as err:

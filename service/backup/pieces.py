@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import os
+import stat
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
@@ -29,7 +30,9 @@ class ListedPieces:
 
 
 def cut(database: Path, folder: Path, earlier: Path | None) -> ListedPieces:
-    """Write a database as pieces into the new ``folder`` (0700, files 0600); pieces that ``earlier`` holds undamaged are linked.
+    """Write a database as pieces into the new ``folder`` (0700, files 0600).
+
+    Pieces that ``earlier`` holds undamaged are linked if they are this account's and for it only: a link keeps owner and rights.
 
     Raises
     ------
@@ -51,9 +54,11 @@ def cut(database: Path, folder: Path, earlier: Path | None) -> ListedPieces:
 
 
 def _link(source: Path, target: Path, data: bytes) -> bool:
-    """Link a piece that holds these bytes; False if there is none, or no link is possible."""
+    """Link a private piece that holds these bytes; False if there is none, or no link is possible."""
     with suppress(OSError):
-        if is_plain(source) and source.stat().st_size == len(data) and source.read_bytes() == data:
+        found = source.lstat()
+        private = found.st_uid == os.geteuid() and found.st_mode == stat.S_IFREG | 0o600
+        if private and found.st_size == len(data) and source.read_bytes() == data:
             os.link(source, target)
             return True
     return False
@@ -66,13 +71,15 @@ def join(folder: Path, names: Sequence[str], target: Path) -> None:
             file.write(data)
 
 
-def check(folder: Path, names: Sequence[str]) -> None:
-    """Refuse a folder with a missing, damaged or additional piece. Raises BackupRefused, OSError."""
+def check(folder: Path, listed: ListedPieces) -> None:
+    """Refuse a folder with a missing, damaged or additional piece, and pieces of another size in all. Raises BackupRefused, OSError."""
     present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
-    if more := sorted(present - set(names)):
+    if more := sorted(present - set(listed.names)):
         raise BackupRefused(f"{folder / more[0]} is not of this backup", "use another backup")
-    for _ in _read(folder, sorted(set(names))):
-        pass
+    each = sorted(set(listed.names))
+    sizes = dict(zip(each, map(len, _read(folder, each)), strict=True))
+    if (found := sum(sizes[name] for name in listed.names)) != listed.bytes:
+        raise BackupRefused(f"the pieces in {folder} have {found} bytes, and their list says {listed.bytes}", "use another backup")
 
 
 def _read(folder: Path, names: Sequence[str]) -> Iterator[bytes]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import stat
@@ -122,6 +123,40 @@ def test_a_damaged_piece_of_the_last_one_is_written_anew(grown: Path) -> None:
     assert third.pieces is not None
     assert third.pieces.new_bytes == third.pieces.bytes
     read_backup(grown / "backups" / "third")
+
+
+@pytest.mark.parametrize("fault", ["for all", "of another account"])
+def test_a_piece_that_is_not_private_is_written_anew(grown: Path, fault: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    if fault == "for all":
+        for piece in (grown / "backups" / "second" / PIECES).iterdir():
+            piece.chmod(0o666)
+    else:
+        monkeypatch.setattr(os, "geteuid", lambda: os.getuid() + 1)
+    third = share(grown, "third", hours=48)
+    assert third.pieces is not None
+    assert third.pieces.new_bytes == third.pieces.bytes
+    made = [path.stat() for path in (grown / "backups" / "third" / PIECES).iterdir()]
+    assert {(stat.S_IMODE(one.st_mode), one.st_nlink) for one in made} == {(0o600, 1)}
+
+
+@pytest.mark.parametrize("which", ["more", "fewer"])
+def test_a_list_of_another_size_is_refused_in_one_line(grown: Path, which: str, capsys: pytest.CaptureFixture[str]) -> None:
+    """Each piece of the list is there, but the database would have a piece twice, or end too early."""
+    path = grown / "backups" / "second" / "backup.json"
+    doc = json.loads(path.read_text())
+    names = doc["pieces"]["names"]
+    doc["pieces"]["names"] = [*names, names[0]] if which == "more" else names[:-1]
+    if which == "fewer":
+        (path.parent / PIECES / names[-1]).unlink()
+    path.write_text(json.dumps(doc))
+    (grown / "new").mkdir()
+    capsys.readouterr()
+    assert run(["restore", str(path.parent), "--db", url(grown / "new")]) == 2
+    said = capsys.readouterr().err
+    assert f"the pieces in {path.parent / PIECES} have " in said
+    assert f" bytes, and their list says {doc['pieces']['bytes']}" in said
+    assert said.count("\n") == 1
+    assert list((grown / "new").iterdir()) == []
 
 
 def test_without_hard_links_it_writes_all(grown: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -85,6 +85,8 @@ def test_every_prompt_of_the_fixture_is_told(lang: str) -> None:
 def test_a_picture_tells_its_texts() -> None:
     assert phrase("en", "At 06:00 on Monday") == "At 06:00 on Monday"
     assert phrase("ja", "Every 2 minutes, counted from 2026-01-01 00:00 UTC") == "2 分ごと、起点 2026-01-01 00:00 UTC"
+    more = {"de": "> 5 × Rauschen", "ja": "ノイズの 5 倍超", "ko": "잡음의 5배 초과"}
+    assert {lang: phrase(lang, "> 5 × noise") for lang in OTHERS} == more, "more than, not at least"
     told = pictured("ja", '<svg aria-label="limit"><title>limit</title><text>a &lt; b &amp; c</text></svg>')
     assert str(told) == '<svg aria-label="限界"><title>限界</title><text>a &lt; b &amp; c</text></svg>'
 
