@@ -209,7 +209,7 @@ def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
         moved, changed = float(np.abs(r.a @ (x - before)).max()), float(np.abs(new - weight).max())
         weight = new
         report(f"round {step + 1}: predictions moved by up to {moved:.2g} sigma, {int((weight < 1).sum())} readings down-weighted")
-        if step >= 2 and moved < SETTLED and changed < SETTLED:
+        if step >= (GENTLE if dirty else 2) and moved < SETTLED and changed < SETTLED:
             break
     return _finish(replace(problem, sizes=sizes), x, weight, c, gram)
 

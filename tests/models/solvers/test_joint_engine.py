@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.bases import SMOOTH_ORDER
+from abbe.models.geometry.volume import unit_deviation, volume_frame
+from abbe.models.solvers import engine
 from abbe.models.solvers.components import folds
 from abbe.models.solvers.engine import repeat_noise_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
@@ -124,3 +126,15 @@ def test_progress_is_told(runs):
 def test_no_runs_is_refused():
     with pytest.raises(ValueError, match="no runs"):
         solve_joint(MACHINE, ())
+
+
+def test_more_rounds_would_move_the_map_by_little_of_its_uncertainty(runs, clean, monkeypatch):
+    at = np.stack(np.meshgrid(*(np.linspace(low, high, 4) for low, high in MACHINE.stroke_mm), indexing="ij"), axis=-1).reshape(-1, 3)
+    field = unit_deviation(MACHINE, clean.terms, at, None, volume_frame(MACHINE))
+    monkeypatch.setattr(engine, "SETTLED", 1e-4)
+    monkeypatch.setattr(engine, "ROUNDS", 30)
+    longer = solve_joint(MACHINE, runs)
+    assert longer.terms == clean.terms
+    moved = field @ (clean.coefficients - longer.coefficients)
+    u = np.sqrt(np.einsum("pij,jk,pik->pi", field, longer.term_covariance, field))
+    assert np.abs(moved / u).max() < 0.05
