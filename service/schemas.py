@@ -10,11 +10,10 @@ from pydantic import BaseModel
 from abbe.drivers.device_file import DeviceFile
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.artefact import ArtefactRunFile
-from abbe.service.domain.discovery_file import DiscoveryFile
+from abbe.service.domain.discovery_file import DiscoveryFile, StandstillFile
 from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.run_file import CampaignFile, ErrorsFile, RunFile
 from abbe.service.domain.solution_file import SolutionFile
-from abbe.service.domain.standstill_file import StandstillFile
 
 MODELS: dict[str, type[BaseModel]] = {
     "machine-file": MachineFile,

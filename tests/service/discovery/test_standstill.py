@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from abbe.service.domain.standstill_file import StandstillFile
+from abbe.service.domain.discovery_file import StandstillFile
 from tests.models.evaluation.heated_machine import heated_days
 from tests.service.cli.test_cli import Abbe, abbe
 
