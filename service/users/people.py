@@ -173,8 +173,8 @@ class UserAccounts:
 
         Raises
         ------
-        UserRefused, PasswordRefused, StoreError
-            The name or role is invalid, the password is weak, or the name is taken.
+        UserRefused, PasswordRefused
+            The name or role is invalid, the name is taken, or the password is weak.
         """
         if not NAME.fullmatch(name):
             raise UserRefused(f"{name!r} is not a valid user name", "use 1 to 64 letters, digits and . _ @ -; begin with a letter or digit")
@@ -191,9 +191,7 @@ class UserAccounts:
     def set_role(self, name: str, role: str) -> None:
         """Change a user's role; the user's sessions end, so that none keeps the old permissions."""
         user, new = self.get(name), role_of(role)
-        if new is not Role.ADMIN:
-            self._keep_an_admin(user)
-        self._store.people.change(user.id, role=new, pin=user.pin if new in PIN_ROLES else None)
+        self._store.people.change(user.id, keep_admin=new is not Role.ADMIN, role=new, pin=user.pin if new in PIN_ROLES else None)
 
     def set_password(self, name: str, password: str) -> None:
         """Change a user's password; the user's sessions end, and the PIN is removed."""
@@ -213,14 +211,7 @@ class UserAccounts:
     def disable(self, name: str, *, enable: bool = False) -> None:
         """Disable a user with all sessions and tokens, or enable it again. Users are never deleted: the audit names them."""
         user = self.get(name)
-        if not enable:
-            self._keep_an_admin(user)
-        self._store.people.change(user.id, disabled_utc=None if enable else utc_text(self._clock.utc()))
-
-    def _keep_an_admin(self, user: UserRecord) -> None:
-        others = [u for u in self._store.people.all() if u.id != user.id and u.role == Role.ADMIN and u.disabled_utc is None]
-        if user.role == Role.ADMIN and user.disabled_utc is None and not others:
-            raise UserRefused(f"{user.name!r} is the only admin", "make another user admin first: abbe user role")
+        self._store.people.change(user.id, keep_admin=not enable, disabled_utc=None if enable else utc_text(self._clock.utc()))
 
     def check(self, name: str, password: str) -> UserRecord | None:
         """The user, if the password matches and the user is enabled; else None. An unknown user takes the same time."""

@@ -8,10 +8,11 @@ from sqlalchemy import ColumnElement, Connection, Update, delete, func, select, 
 
 from abbe.service.clock import utc_text
 from abbe.service.domain.people import SessionRecord, TokenRecord, UserRecord
-from abbe.service.errors import StoreError
-from abbe.service.storage.database import SESSION, TOKEN, USER, Repository, insert_row
+from abbe.service.errors import StoreError, UserRefused
+from abbe.service.storage.database import SESSION, TOKEN, USER, Repository, dialect_insert, insert_row
 from abbe.service.storage.tables import api_tokens, sessions, users
 
+_ACTIVE_ADMIN = (users.c.disabled_utc.is_(None), users.c.role == "admin", users.c.password.like("$argon2%"))
 FORGOTTEN = timedelta(days=30)
 """Age at which the row of a session is deleted; it has ended long ago."""
 
@@ -24,14 +25,16 @@ class People(Repository):
 
         Raises
         ------
-        StoreError
+        UserRefused
             The name is taken.
         """
 
         def work(connection: Connection) -> int:
-            if connection.execute(select(users.c.id).where(users.c.name == name)).first() is not None:
-                raise StoreError(f"there is a user {name!r} already", "give another name")
-            return insert_row(connection, users, name=name, role=role, password=password, created_utc=self._db.now())
+            fresh = dialect_insert(connection, users).values(name=name, role=role, password=password, created_utc=self._db.now())
+            number = connection.execute(fresh.on_conflict_do_nothing().returning(users.c.id)).scalar()
+            if number is None:
+                raise UserRefused(f"there is a user {name!r} already", "give another name")
+            return int(number)
 
         return self._db.commit(work)
 
@@ -45,14 +48,25 @@ class People(Repository):
 
     def active_admins(self) -> int:
         """Count the admins who can log in: those not disabled who have a password."""
-        query = select(func.count()).select_from(users)
-        query = query.where(users.c.disabled_utc.is_(None), users.c.role == "admin", users.c.password.like("$argon2%"))
+        query = select(func.count()).select_from(users).where(*_ACTIVE_ADMIN)
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))
 
-    def change(self, user_id: int, *, keep_session: bool = False, **values: str | None) -> None:
-        """Change role, password, PIN or ``disabled_utc`` of a user, and end the user's sessions in the same transaction."""
+    def change(self, user_id: int, *, keep_session: bool = False, keep_admin: bool = False, **values: str | None) -> None:
+        """Change role, password, PIN or ``disabled_utc`` of a user, and end the user's sessions in the same transaction.
+
+        Raises
+        ------
+        UserRefused
+            With ``keep_admin``: the user is the only active admin.
+        """
 
         def work(connection: Connection) -> None:
+            if keep_admin:
+                # PostgreSQL lets others write at the same time: the locks make them wait, and then see this change.
+                admins = connection.execute(select(users.c.id, users.c.name).where(*_ACTIVE_ADMIN).order_by(users.c.id).with_for_update())
+                found = admins.all()
+                if [admin.id for admin in found] == [user_id]:
+                    raise UserRefused(f"{found[0].name!r} is the only admin", "make another user admin first: abbe user role")
             connection.execute(update(users).where(users.c.id == user_id).values(**values))
             if not keep_session:
                 connection.execute(_ended(self._db.now()).where(sessions.c.user_id == user_id))

@@ -57,12 +57,7 @@ def _add_forms(app: FastAPI, context: PageContext) -> None:
     @app.post("/users/add", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.USERS)
     async def add(request: Request) -> Response:
-        def work(form: Form) -> None:
-            name = form.get("name", "")
-            if people.known(name):
-                raise UserRefused(f"there is a user {name!r} already", "give another name")
-            people.add(name, form.get("role", ""), _same(form))
-
+        work: Callable[[Form], None] = lambda form: people.add(form.get("name", ""), form.get("role", ""), _same(form))  # noqa: E731
         return await _changed(request, context, lambda form: f"add {form.get('role', '')}", work)
 
     @app.post("/users/role", include_in_schema=False, max_body_size=LONGEST_FORM)
@@ -74,7 +69,15 @@ def _add_forms(app: FastAPI, context: PageContext) -> None:
     @app.post("/users/password", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.USERS)
     async def password(request: Request) -> Response:
-        return await _changed(request, context, lambda _: "password", lambda form: people.set_password(form.get("name", ""), _same(form)))
+        visit: Visit = request.state.visit
+        own = visit.principal.name.partition(":")[2].partition("/")[0]  # a token has its owner's
+
+        def work(form: Form) -> None:
+            if form.get("name", "") == own:
+                raise UserRefused("you change your own password in the settings", "give the present one there")
+            people.set_password(form.get("name", ""), _same(form))
+
+        return await _changed(request, context, lambda _: "password", work)
 
     @app.post("/users/disable", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.USERS)

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.errors import PasswordRefused, StoreError, UserRefused
+from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.users.lockout import MOST, Buckets, Lockout, LoginOrigin
 from abbe.service.users.people import ANONYMOUS, AT_A_TIME, Passwords, digest_of
 from abbe.service.users.roles import ALLOWED, Permission, Role
@@ -59,7 +59,7 @@ def test_a_name_is_plain(world: World, name: str) -> None:
 
 def test_names_and_roles_are_checked(world: World) -> None:
     world.people.add("ana", "viewer", PHRASE)
-    with pytest.raises(StoreError, match="there is a user 'ana' already"):
+    with pytest.raises(UserRefused, match="there is a user 'ana' already"):
         world.people.add("ana", "viewer", PHRASE)
     with pytest.raises(UserRefused, match="one of: viewer, operator, metrologist, approver, admin"):
         world.people.set_role("ana", "root")

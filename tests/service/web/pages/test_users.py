@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import httpx
 import pytest
@@ -79,6 +81,31 @@ def test_the_last_admin_stays_and_no_refusal_names_a_command(alone: Served) -> N
         ):
             assert answer.status_code == 409
             assert "abbe user" not in answer.text
+
+
+def test_a_name_added_twice_at_once_is_added_and_refused(alone: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Both have looked for the name when either writes: the second is no fault of the store."""
+    barrier, work = threading.Barrier(2, timeout=10), alone.store.people.add
+
+    def met(name: str, role: str, password: str) -> int:
+        barrier.wait()
+        return work(name, role, password)
+
+    monkeypatch.setattr(alone.store.people, "add", met)
+    form = {"name": "nora", "role": "operator", "new": NEW, "again": NEW}
+    with as_user(alone, "adam") as client, ThreadPoolExecutor(2) as pool:
+        answers = pool.map(lambda _: client.post("/users/add", data=form).status_code, range(2))
+        assert sorted(answers) == [303, 409]
+
+
+def test_an_admin_changes_the_own_password_in_the_settings_only(alone: Served) -> None:
+    with as_user(alone, "adam") as client:
+        answer = client.post("/users/password", data={"name": "adam", "new": NEW, "again": NEW})
+        assert (answer.status_code, answer.json()["detail"]) == (409, "you change your own password in the settings")
+    token = alone.people.add_token("adam", "ci", ["users"], 1)
+    with httpx.Client(base_url=alone.base, headers={"Authorization": f"Bearer {token}"}) as program:
+        assert program.post("/users/password", data={"name": "adam", "new": NEW, "again": NEW}).status_code == 409
+    assert alone.people.check("adam", PHRASE) is not None
 
 
 def test_an_own_password_needs_the_present_one_and_ends_every_login(alone: Served) -> None:
