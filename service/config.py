@@ -8,9 +8,10 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
 
@@ -28,11 +29,12 @@ PREFIX = "ABBE_"
 
 @dataclass(frozen=True, slots=True)
 class LoadedMachine:
-    """A machine file with its effective values; ``origins``: dotted key to the source of its value."""
+    """A machine file with its effective values; ``origins``: dotted key to the source of its value; ``body``: the bytes that were read."""
 
     path: Path
     machine: MachineFile
     origins: dict[str, Origin]
+    body: bytes = field(repr=False)
 
     @property
     def database_url(self) -> str:
@@ -47,14 +49,13 @@ class LoadedMachine:
         return [(key, mask_secrets(value) if isinstance(value, str) else value, self.origins.get(key, "default")) for key, value in found]
 
     def summary(self) -> MachineFileSummary:
-        """The values for the page, with their lines in the file as it is now."""
-        body = self.path.read_bytes()
-        lines = key_lines(body.decode("utf-8", "replace"))
+        """The values for the page, with their lines in the file as it was read."""
+        lines = key_lines(_text(self.body))
         stated = tuple(
             StatedValue(key[:WORD], json.dumps(value, ensure_ascii=False)[:TEXT], origin, lines.get(key, 0) if origin == "file" else 0)
             for key, value, origin in self.values()
         )
-        return MachineFileSummary(str(self.path.resolve())[:TEXT], hashlib.sha256(body).hexdigest(), stated)
+        return MachineFileSummary(str(self.path.resolve())[:TEXT], hashlib.sha256(self.body).hexdigest(), stated)
 
 
 def load_machine(path: Path | str) -> LoadedMachine:
@@ -66,7 +67,7 @@ def load_machine(path: Path | str) -> LoadedMachine:
         Names file, key, and the expected value.
     """
     path = Path(path)
-    from_file = read_toml(path)
+    from_file, body = _read_toml(path, "machine file")
     from_environment = _overrides()
     merged = _merged(from_file, from_environment)
     try:
@@ -78,7 +79,7 @@ def load_machine(path: Path | str) -> LoadedMachine:
     machine = _with_files(machine, path.resolve().parent)
     origins: dict[str, Origin] = dict.fromkeys((key for key, _ in _leaves(from_file)), "file")
     origins |= dict.fromkeys((key for key, _ in _leaves(from_environment)), "environment")
-    return LoadedMachine(path, machine, origins)
+    return LoadedMachine(path, machine, origins, body)
 
 
 def _with_files(machine: MachineFile, folder: Path) -> MachineFile:
@@ -107,8 +108,13 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
     ConfigError
         The file is missing, unreadable, not UTF-8 or not TOML; the message says which.
     """
+    return _read_toml(path, what)[0]
+
+
+def _read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
     try:
-        return tomllib.loads(path.read_text(encoding="utf-8"))
+        body = path.read_bytes()
+        return tomllib.loads(_text(body)), body
     except FileNotFoundError:
         raise ConfigError(f"{what} {path} does not exist", "give the path of a machine file, e.g. deploy/machine.toml") from None
     except OSError as err:
@@ -123,22 +129,54 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
         raise ConfigError(f"{path}: an integer has thousands of digits", "correct the file") from None
 
 
-def key_lines(text: str) -> dict[str, int]:
-    """Number of the line, from 1, on which each key of a TOML text begins.
+def _text(body: bytes) -> str:
+    """The text of a file, each line with one end. Raises UnicodeDecodeError."""
+    return body.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
-    A text cut after a line is valid TOML only if no value is open there, so the TOML library itself finds the lines.
-    """
+
+_TOKEN = re.compile(r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{]|[\]}]|\n""", re.DOTALL)
+"""What can hide, open or close brackets and lines of TOML: texts, comments, brackets, ends of lines."""
+
+
+def key_lines(text: str) -> dict[str, int]:
+    """Number of the line, from 1, on which each key of a valid TOML text (lines end with ``\\n``) begins."""
     found: dict[str, int] = {}
-    lines, begun = text.split("\n"), 1
-    for end in range(1, len(lines) + 1):
-        try:
-            values = tomllib.loads("\n".join(lines[:end]))
-        except tomllib.TOMLDecodeError:
-            continue
-        for key, _ in _leaves(values):
-            found.setdefault(key, begun)
-        begun = end + 1
+    tables: dict[str, int] = {}  # how many tables of a list there are so far
+    prefix = ""
+    for line, statement in _statements(text):
+        values = tomllib.loads(statement)
+        if statement.lstrip(" \t").startswith("["):
+            prefix = _header(values, tables)
+        else:
+            found |= {key: line for key, _ in _leaves(values, prefix)}
     return found
+
+
+def _statements(text: str) -> Iterator[tuple[int, str]]:
+    """Each header, key with its value, comment or empty line, with the number of its first line."""
+    line, begun, start, depth = 1, 1, 0, 0
+    for token in _TOKEN.finditer(text):
+        found = token[0]
+        depth += (found in "[{") - (found in "]}")
+        line += found.count("\n")
+        if found == "\n" and depth == 0:
+            yield begun, text[start : token.start()]
+            begun, start = line, token.end()
+    yield begun, text[start:]
+
+
+def _header(values: Mapping[str, Any], tables: dict[str, int]) -> str:
+    """Prefix of the keys below a header; a further table of a list is counted in ``tables``."""
+    prefix, inside = "", values
+    while inside:
+        ((key, found),) = inside.items()
+        prefix += key
+        if isinstance(found, list):
+            tables[prefix] = tables.get(prefix, 0) + 1
+            found = found[0]
+        prefix += f"[{tables[prefix]}]." if prefix in tables else "."
+        inside = found
+    return prefix
 
 
 def _overrides() -> dict[str, Any]:

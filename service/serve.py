@@ -120,7 +120,7 @@ class Service:
         setup = self._setup
         broker = "" if setup.broker is None else str(setup.broker)
         hosts = (*LOCAL, *setup.web.names, *(() if setup.web.host in EVERYWHERE else (setup.web.host,)))
-        return Begin(
+        begin = Begin(
             "begin",
             PROTOCOL,
             setup.machine,
@@ -140,8 +140,9 @@ class Service:
             setup.web.memory_mb,
             setup.control,
             self._pushes_itself,
-            setup.stated,
+            None,
         )
+        return begin if setup.stated is None else begin.stating(setup.stated)
 
     def _changed(self) -> None:
         self._web.changed()

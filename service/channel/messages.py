@@ -14,7 +14,7 @@ from __future__ import annotations
 import asyncio
 import socket
 import struct
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
@@ -75,6 +75,10 @@ class Begin:
     control: Text
     pushes_itself: bool
     stated: MachineFileSummary | None
+
+    def stating(self, stated: MachineFileSummary) -> Begin:
+        """This message with as much of the machine file as it can hold."""
+        return replace(self, stated=stated.within(LARGEST_B - len(encode(replace(self, stated=None)))))
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 from pydantic import Field
@@ -10,6 +11,9 @@ from pydantic import Field
 from abbe.service.domain.bounds import Number, Text, Word
 
 Origin = Literal["default", "file", "environment"]
+MOST_VALUES = 5000
+ABOUT_BYTES = 200
+"""JSON of a record beside its texts of any length, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,11 +28,24 @@ class StatedValue:
 
 @dataclass(frozen=True, slots=True)
 class MachineFileSummary:
-    """The machine file as the service read it at its start. ``sha256``: of the file."""
+    """The machine file as the service read it at its start. ``sha256``: of the file; ``left_out``: how many values are not among these."""
 
     path: Text
     sha256: Word
-    values: Annotated[tuple[StatedValue, ...], Field(max_length=5000)]
+    values: Annotated[tuple[StatedValue, ...], Field(max_length=MOST_VALUES)]
+    left_out: Number = 0
+
+    def within(self, most_bytes: int) -> MachineFileSummary:
+        """As many values as fit into so many bytes of JSON, first those of the file and the environment, then defaults."""
+        kept, room = set[int](), most_bytes - len(json.dumps(self.path)) - ABOUT_BYTES
+        for k in sorted(range(len(self.values)), key=lambda k: self.values[k].origin == "default"):
+            one = self.values[k]
+            room -= len(json.dumps([one.key, one.value], ensure_ascii=False).encode()) + ABOUT_BYTES
+            if room < 0 or len(kept) == MOST_VALUES:
+                break
+            kept.add(k)
+        values = tuple(one for k, one in enumerate(self.values) if k in kept)
+        return replace(self, values=values, left_out=self.left_out + len(self.values) - len(values))
 
     def sections(self) -> dict[str, list[StatedValue]]:
         """The values by section, in the order of the documentation; ``""``: what stands above all sections."""

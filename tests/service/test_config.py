@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import time
 from pathlib import Path
 
 import pytest
@@ -215,3 +217,50 @@ def test_every_key_has_the_line_on_which_it_begins() -> None:
     text = 'a = 1\n\n[b]\nlong = [\n  1,\n  2,\n]\nsaid = """\nc = 5\n"""\ninline = {x = 1, y = 2}\n[[d]]\ne = 1\n# e = 2\n[[d]]\ne = 3\n'
     lines = {"a": 1, "b.long": 4, "b.said": 8, "b.inline.x": 11, "b.inline.y": 11, "d[1].e": 13, "d[2].e": 16}
     assert key_lines(text) == lines
+
+
+def test_dotted_and_quoted_keys_lists_of_tables_and_long_texts_have_their_lines() -> None:
+    text = """a.b = 1 # [
+"c d" . 'e' = "# [ \\" {"
+[[f]]
+g = [ # ]
+  "]", ']',
+  { h = 1 },
+]
+  [f.i]
+  j = '''
+k = [''''
+[[f.l]]
+m = 1
+[[f.l]]
+m = \"\"\"
+\\\"\"\" [
+\"\"\"
+[[f]]
+[f.i]
+j = 2
+[[f.l]]
+m.n = 3
+o = [{p = 1}, {p = 2}]
+"""
+    lines = {"a.b": 1, "c d.e": 2, "f[1].g": 4, "f[1].i.j": 9, "f[1].l[1].m": 12, "f[1].l[2].m": 14, "f[2].i.j": 19}
+    lines |= {"f[2].l[1].m.n": 21, "f[2].l[1].o[1].p": 22, "f[2].l[1].o[2].p": 22}
+    assert key_lines(text) == lines
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_the_lines_of_a_long_file_are_found_at_once(file: Path, end: str) -> None:
+    """3000 lines; the digest is that of the bytes that were read, also when the file is written meanwhile."""
+    head = file.read_text()
+    entry = '[[schedule]]\nname = "s"\nrecipe = "quick-check"\ncron = "0 6 * * 1-5"\ntimezone = "Europe/Berlin"\n'
+    body = (head + entry.replace('"s"', '"s1"') + "# more\n" * 3000 + entry.replace('"s"', '"s2"')).replace("\n", end).encode()
+    file.write_bytes(body)
+    loaded = load_machine(file)
+    file.write_text(head)
+    begun = time.process_time()
+    made = loaded.summary()
+    assert time.process_time() - begun < 2.0
+    assert made.sha256 == hashlib.sha256(body).hexdigest()
+    found = {one.key: one.line for one in made.values}
+    first = head.count("\n") + 2
+    assert (found["schedule[2].name"], found["schedule[3].cron"]) == (first, first + 3007)

@@ -19,6 +19,7 @@ from hypothesis import strategies as st
 from abbe.service.channel import messages as m
 from abbe.service.channel.messages import FULL_B, Wire
 from abbe.service.clock import SystemClock
+from abbe.service.config import load_machine
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
@@ -372,3 +373,22 @@ async def test_a_web_process_that_hangs_or_dies_is_replaced(tmp_path: Any, monke
         async with asyncio.timeout(within(10)):
             await running
         assert child.returncode == 0
+
+
+def test_a_long_machine_file_is_cut_to_one_message(tmp_path: Path) -> None:
+    """200 schedules with names of 32 letters: what the file states comes before defaults, and the page learns how much is missing."""
+    entry = '[[schedule]]\nname = "{:032}"\nrecipe = "quick-check"\ncron = "0 6 * * 1-5"\ntimezone = "Europe/Berlin"\n'
+    head = 'name = "VMC-1"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 600]\nY = [0, 500]\nZ = [0, 450]\n'
+    path = tmp_path / "machine.toml"
+    path.write_text(head + "".join(map(entry.format, range(200))))
+    loaded = load_machine(path)
+    stated = loaded.summary()
+    begin = replace(CORE[0], schedules=tuple(loaded.machine.schedule))
+    with pytest.raises(ChannelBroken, match="a message of"):
+        m.encode(replace(begin, stated=stated))
+    sent = m.from_core(m.encode(begin.stating(stated)))
+    assert isinstance(sent, m.Begin)
+    assert sent.stated is not None
+    assert 0 < sent.stated.left_out == len(stated.values) - len(sent.stated.values)
+    assert [one for one in sent.stated.values if one.origin == "file"] == [one for one in stated.values if one.origin == "file"]
+    assert m.from_core(m.encode(CORE[0].stating(CORE[0].stated))) == CORE[0]
