@@ -208,7 +208,9 @@ async def test_the_bridge_keeps_every_promise_of_a_safe_push(machine, tmp_path):
         async with controller(machine) as cnc:
             assert (await bring(cnc, store, site, tables_of_nine(nine(1)))).kept
             before = await cnc.comp_status()
-            added = await machine.hal("abbe-corr-x", "abbe-corr-y", "abbe-corr-z")
+            async with asyncio.timeout(within(5)):  # the pins follow in the control's next periods
+                while not any(added := await machine.hal("abbe-corr-x", "abbe-corr-y", "abbe-corr-z")):
+                    await asyncio.sleep(0.05)
             found = await commission_levels(cnc, store, site)
             after = await cnc.comp_status()
             assert found.capabilities.level == 3, found.rows()

@@ -52,7 +52,7 @@ def sim(
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     arguments = list(context.args)
     if {"-h", "--help"} & set(arguments):
-        typer.echo("abbe sim [--machine-file FILE] ...: FILE is a new machine file for it; the other options:")
+        typer.echo("abbe sim [--machine-file FILE] ...: FILE is a new machine file for it; the other options:", err=True)
     if file is not None and file.exists():
         raise ConfigError(f"{file} exists", "remove it, or give another name")
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:
