@@ -265,6 +265,7 @@ users = Table(
     Column("role", String(20), nullable=False),
     Column("password", String(200), nullable=False),
     Column("pin", String(200)),
+    Column("pin_failures", Integer, nullable=False, server_default="0"),
     Column("disabled_utc", String(32)),
     Column("created_utc", String(32), nullable=False),
 )

@@ -10,12 +10,16 @@ from alembic.autogenerate import compare_metadata
 from alembic.migration import MigrationContext
 from sqlalchemy import Engine, inspect
 
+from abbe.service.clock import SystemClock
 from abbe.service.errors import StoreError
 from abbe.service.storage.engine import current_revision, downgrade, head_revision, make_engine, upgrade
 from abbe.service.storage.migrations.versions import r0100_first as first
 from abbe.service.storage.store import Store
 from abbe.service.storage.tables import metadata
+from abbe.service.users.people import Passwords, UserAccounts
 from tests.migration import next_revision
+
+PHRASE, CHEAP = "correct horse battery staple", Passwords(memory_kib=64, passes=1)
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
@@ -86,3 +90,21 @@ def test_an_older_sqlite_file_is_copied_before_an_upgrade(tmp_path: Path, monkey
     assert current_revision(old) == newest
     assert "gauges" not in inspect(old).get_table_names()
     old.dispose()
+
+
+@pytest.mark.parametrize("has_pin", [False, True])
+def test_a_database_of_the_first_schema_gets_what_it_lacks(engine: Engine, has_pin: bool) -> None:
+    """For a day the first schema was made with or without the column of the PIN; both came from the program of that day."""
+    upgrade(engine, "0100")
+    with engine.begin() as connection:
+        if has_pin:
+            connection.exec_driver_sql("ALTER TABLE users ADD COLUMN pin VARCHAR(200)")
+        columns, values = "name, role, password, created_utc", f"'ana', 'admin', '{CHEAP.hash(PHRASE)}', '2026-11-26T09:00:00.000000Z'"
+        connection.exec_driver_sql(f"INSERT INTO users ({columns}) VALUES ({values})")
+    with Store.open(engine.url.render_as_string(hide_password=False)) as store:
+        people = UserAccounts(store, SystemClock(), CHEAP)
+        assert people.check("ana", PHRASE) is not None
+        people.add("olga", "operator", PHRASE)
+        people.set_pin("olga", "582914")
+        assert people.check_pin("olga", "582914") is not None
+    test_up_gives_the_tables_of_the_program(engine)
