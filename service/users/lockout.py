@@ -1,4 +1,4 @@
-"""Rate limits for passwords: in memory, bounded and always temporary, so that the last admin cannot be locked out."""
+"""Rate limits for passwords and PINs: in memory, bounded and always temporary, so that the last admin cannot be locked out."""
 
 from __future__ import annotations
 
@@ -22,12 +22,13 @@ class LoginOrigin:
     """Origin of a login attempt.
 
     ``address``: of the visitor; ``device``: id of a browser with which this account has logged in before, or empty; ``local``: the login
-    comes from the service's own computer.
+    comes from the service's own computer; ``pin``: the attempt is a PIN, whose failures do not delay the password.
     """
 
     address: str
     device: str = ""
     local: bool = False
+    pin: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +105,7 @@ class Lockout:
     def _rules(self, account: str, origin: LoginOrigin) -> tuple[_Rule, ...]:
         account, net = _fold(account), _net(origin.address)
         if origin.device:
-            return (_Rule((account, f"device {origin.device}")),)
+            return (_Rule((account, f"{'PIN at' if origin.pin else 'device'} {origin.device}")),)
         of_address = _Rule(("", net), FREE_OF_ADDRESS)
         if origin.local or (account, net) in self._known:
             return (_Rule((account, net)), of_address)

@@ -33,6 +33,8 @@ LEAST_DIFFERENT = 5
 PIN, LEAST_DIFFERENT_DIGITS = re.compile(r"[0-9]{6,12}"), 3
 PIN_ROLES = frozenset({Role.VIEWER, Role.OPERATOR})
 """Roles whose users may log in by PIN, which is easier to guess than a password: none that proposes, approves or manages."""
+MOST_WRONG_PINS = 10
+"""Wrong PINs in a row, at all browsers and over restarts, after which the PIN is removed."""
 T = TypeVar("T")
 COMMON = ("password", "passwort", "qwertyuiop", "administrator", "letmein", "welcome", "1234567890", "abcdefghij", "changeme")
 
@@ -137,7 +139,9 @@ LONGEST = timedelta(hours=12)
 TOUCH = timedelta(seconds=30)
 """Shortest interval between stored uses of a session: a page that refreshes itself must not write each time."""
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._@-]{0,63}")
-DEVICE = re.compile(r"[0-9a-f]{32}\.[0-9a-f]{64}")
+DEVICE = re.compile(r"([0-9a-f]{32})\.([0-9]{1,11})\.([0-9a-f]{64})")
+DEVICE_LIFE = timedelta(days=90)
+"""How long a browser is recognized after a login by password."""
 TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 
 
@@ -206,7 +210,7 @@ class UserAccounts:
             raise UserRefused(f"a user who is {user.role} logs in with a password only", "use the password")
         if pin:
             check_new_pin(pin)
-        self._store.people.change(user.id, keep_session=True, pin=self.passwords.hash(pin) if pin else None)
+        self._store.people.change(user.id, keep_session=True, pin=self.passwords.hash(pin) if pin else None, pin_failures=0)
 
     def disable(self, name: str, *, enable: bool = False) -> None:
         """Disable a user with all sessions and tokens, or enable it again. Users are never deleted: the audit names them."""
@@ -223,15 +227,27 @@ class UserAccounts:
             self._store.people.change(user.id, keep_session=True, password=self.passwords.hash(password))
         return user
 
-    def check_pin(self, name: str, pin: str) -> UserRecord | None:
-        """The user, if the PIN matches, the role may use one and the user is enabled; else None. The answer always takes the same time."""
+    def check_pin(self, name: str, pin: str) -> tuple[UserRecord | None, bool]:
+        """The user, if the PIN matches, the role may use one and the user is enabled, else None; and whether this try removed the PIN.
+
+        `MOST_WRONG_PINS` wrong ones in a row remove it.
+        """
         user = self._store.people.find(name) if NAME.fullmatch(name) else None
-        right = self.passwords.verify(None if user is None else user.pin, pin)
-        return user if right and user is not None and user.disabled_utc is None and Role(user.role) in PIN_ROLES else None
+        if user is None or not _may_use_pin(user):
+            self.passwords.verify(None, pin)
+            return None, False
+        # Counted before the check: simultaneous tries must not all find one left.
+        tries = self._store.people.count_pin(user.id)
+        if self.passwords.verify(user.pin if tries <= MOST_WRONG_PINS else None, pin):
+            self._store.people.change(user.id, keep_session=True, pin_failures=0)
+            return user, False
+        if tries >= MOST_WRONG_PINS:
+            self._store.people.change(user.id, keep_session=True, pin=None, pin_failures=0)
+        return None, tries >= MOST_WRONG_PINS
 
     def with_pin(self) -> list[UserRecord]:
         """Users who may log in by PIN."""
-        return [u for u in self._store.people.all() if u.pin is not None and u.disabled_utc is None and Role(u.role) in PIN_ROLES]
+        return [user for user in self._store.people.all() if _may_use_pin(user)]
 
     def known(self, name: str) -> bool:
         """Whether there is such a user. Callers must not show or log an unknown name: it may be a mistyped password."""
@@ -269,18 +285,22 @@ class UserAccounts:
         return Principal(f"user:{user.name}", role, ALLOWED[role], "session", digest)
 
     def device_of(self, name: str, cookie: str) -> str:
-        """Id of a browser, if this user has logged in with it since the password was set; else empty.
+        """Id of a browser, if this user has logged in with it in the last `DEVICE_LIFE` and since the password was set; else empty.
 
         The cookie is not stored. The key of its seal is the hash of the user's password; this hash never leaves the database.
         """
-        label, _, seal = cookie.partition(".")
-        user = self._store.people.find(name) if DEVICE.fullmatch(cookie) and NAME.fullmatch(name) else None
-        return label if user is not None and hmac.compare_digest(seal, _device_seal(user, label)) else ""
+        found = DEVICE.fullmatch(cookie) if NAME.fullmatch(name) else None
+        user = self._store.people.find(name) if found else None
+        if found is None or user is None:
+            return ""
+        label, end_s, seal = found.groups()
+        right = hmac.compare_digest(seal, _device_seal(user, label, end_s))
+        return label if right and self._clock.utc().timestamp() < int(end_s) else ""
 
-    def new_device(self, user: UserRecord) -> str:
-        """Make a cookie that identifies the browser at this user's next login."""
-        label = secrets.token_hex(16)
-        return f"{label}.{_device_seal(user, label)}"
+    def new_device(self, user: UserRecord, label: str = "") -> str:
+        """Make the cookie that identifies a browser at this user's next logins for `DEVICE_LIFE`; ``label``: id of a known browser."""
+        label, end_s = label or secrets.token_hex(16), str(int((self._clock.utc() + DEVICE_LIFE).timestamp()))
+        return f"{label}.{end_s}.{_device_seal(user, label, end_s)}"
 
     def add_token(self, name: str, title: str, scopes: list[str], days: float) -> str:
         """Make a token of a user; return its text, which is not stored.
@@ -345,9 +365,13 @@ def role_of(text: str) -> Role:
         raise UserRefused(f"there is no role {text!r}", f"one of: {', '.join(Role)}") from None
 
 
-def _device_seal(user: UserRecord, label: str) -> str:
+def _may_use_pin(user: UserRecord) -> bool:
+    return user.pin is not None and user.disabled_utc is None and Role(user.role) in PIN_ROLES
+
+
+def _device_seal(user: UserRecord, label: str, end_s: str) -> str:
     key = hashlib.sha256(b"abbe device " + user.password.encode()).digest()
-    return hmac.new(key, f"{user.name} {label}".encode(), hashlib.sha256).hexdigest()
+    return hmac.new(key, f"{user.name} {label} {end_s}".encode(), hashlib.sha256).hexdigest()
 
 
 def digest_of(secret: str) -> str:

@@ -51,7 +51,7 @@ class People(Repository):
         query = select(func.count()).select_from(users).where(*_ACTIVE_ADMIN)
         return int(self._db.read(lambda connection: connection.execute(query).scalar_one()))
 
-    def change(self, user_id: int, *, keep_session: bool = False, keep_admin: bool = False, **values: str | None) -> None:
+    def change(self, user_id: int, *, keep_session: bool = False, keep_admin: bool = False, **values: str | int | None) -> None:
         """Change role, password, PIN or ``disabled_utc`` of a user, and end the user's sessions in the same transaction.
 
         Raises
@@ -72,6 +72,11 @@ class People(Repository):
                 connection.execute(_ended(self._db.now()).where(sessions.c.user_id == user_id))
 
         self._db.commit(work)
+
+    def count_pin(self, user_id: int) -> int:
+        """Count a try of a user's PIN as wrong; return the number of wrong ones in a row."""
+        statement = update(users).where(users.c.id == user_id).values(pin_failures=users.c.pin_failures + 1).returning(users.c.pin_failures)
+        return int(self._db.commit(lambda connection: connection.execute(statement).scalar_one()))
 
     def add_session(self, user_id: int, digest: str, instead_of: str = "") -> int:
         """Begin a session and end the one of digest ``instead_of`` (empty: none); delete rows older than a month."""

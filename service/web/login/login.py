@@ -11,9 +11,11 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.people import UserRecord
 from abbe.service.queries import people
 from abbe.service.users.lockout import LoginOrigin
+from abbe.service.users.people import DEVICE_LIFE, MOST_WRONG_PINS
 from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.listening import is_local
@@ -25,8 +27,6 @@ from abbe.service.web.problems import problem
 from abbe.service.web.schemas import AuditList, Me, Problem, UserList
 
 LONGEST_FORM = 4096
-DEVICE_S = 90 * 86_400
-"""How long a browser with an earlier login is recognized; see `service/users/lockout.py`."""
 
 
 def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
@@ -52,21 +52,22 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
             return problem(413, "a login is a short form of two fields")
         name, by_pin = fields.get("name", ""), "pin" in fields
         visit.target = "unknown user"
-        origin = await asyncio.to_thread(_login_origin, auth, request, name)
+        origin = await asyncio.to_thread(_login_origin, auth, request, name, pin=by_pin)
         if by_pin and not origin.device:
             return await page(request, 401, say("login.password_first"))
-        user, wait_s, tried = await identified(auth, origin, name, fields.get("pin" if by_pin else "password", ""), by_pin=by_pin)
+        user, wait_s, tried = await identified(auth, origin, name, fields.get("pin" if by_pin else "password", ""))
         if tried and await asyncio.to_thread(auth.people.known, name):
-            visit.target = name
+            visit.target = f"{name}, by PIN" if by_pin else name
         if user is None:
-            text = " ".join(say(key, n=ceil(wait_s)) for key in _refusals(wait_s, tried=tried))
+            removed = by_pin and tried and name not in await asyncio.to_thread(_with_pin_here, auth, request)
+            keys = ["login.no_pin"] if removed else _refusals(wait_s, tried=tried)
+            text = " ".join(say(key, n=ceil(wait_s)) for key in keys)
             return await page(request, 401 if tried else 429, text, 0.0 if tried else wait_s)
         visit.who = f"user:{user.name}"
         answer = RedirectResponse("/", 303)
         _set_cookie(auth, request, answer, await asyncio.to_thread(auth.people.begin, user, visit.secret))
-        if not origin.device:
-            made, tls = await asyncio.to_thread(auth.people.new_device, user), is_tls(request, behind_tls=auth.behind_tls)
-            answer.set_cookie(auth.device_cookie(user.name), made, DEVICE_S, path="/login", httponly=True, samesite="strict", secure=tls)
+        if not by_pin:
+            _set_device_cookie(auth, request, answer, user, origin.device)
         return answer
 
     _add_logout(app, auth)
@@ -85,19 +86,23 @@ def _add_logout(app: FastAPI, auth: Authenticator) -> None:
         return answer
 
 
-async def identified(
-    auth: Authenticator, origin: LoginOrigin, name: str, secret: str, *, by_pin: bool = False
-) -> tuple[UserRecord | None, float, bool]:
+async def identified(auth: Authenticator, origin: LoginOrigin, name: str, secret: str) -> tuple[UserRecord | None, float, bool]:
     """Return the user with this name and password (or PIN), or None; seconds until the next try; whether the password was checked at all.
 
-    It is not checked after too many wrong tries.
+    It is not checked after too many wrong tries. The audit records the removal of a PIN.
     """
     wait_s = auth.lockout.wait_s(name, origin)
     if wait_s > 0:
         return None, wait_s, False
     # Counted before the password check: simultaneous tries must not all find the account unlocked.
     wait_s = auth.lockout.failed(name, origin)
-    user = await asyncio.to_thread(auth.people.check_pin if by_pin else auth.people.check, name, secret)
+    if origin.pin:
+        user, removed = await asyncio.to_thread(auth.people.check_pin, name, secret)
+        if removed:  # a record of its own: those of wrong logins are thinned out
+            target, doc = f"user {name}: PIN removed after {MOST_WRONG_PINS} wrong ones", {"address": origin.address}
+            await auth.record(AuditEvent(who="anonymous", action="POST /login", target=target, outcome="done", doc=doc))
+    else:
+        user = await asyncio.to_thread(auth.people.check, name, secret)
     if user is not None:
         auth.lockout.succeeded(name, origin)
     return user, wait_s, True
@@ -150,10 +155,10 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
         return AuditList(records=await asyncio.to_thread(people.audit, auth.store, limit))
 
 
-def _login_origin(auth: Authenticator, request: Request, name: str) -> LoginOrigin:
+def _login_origin(auth: Authenticator, request: Request, name: str, *, pin: bool = False) -> LoginOrigin:
     visit: Visit = request.state.visit
     device = auth.people.device_of(name, request.cookies.get(auth.device_cookie(name), ""))
-    return LoginOrigin(visit.address, device, local=is_local(visit.address) and not auth.behind_tls)
+    return LoginOrigin(visit.address, device, local=is_local(visit.address) and not auth.behind_tls, pin=pin)
 
 
 def _refusals(wait_s: float, *, tried: bool) -> list[str]:
@@ -165,6 +170,13 @@ def _with_pin_here(auth: Authenticator, request: Request) -> list[str]:
     """Names of the users who may log in by PIN in this browser, since they have logged in there by password."""
     names = [user.name for user in auth.people.with_pin()]
     return [name for name in names if auth.people.device_of(name, request.cookies.get(auth.device_cookie(name), ""))]
+
+
+def _set_device_cookie(auth: Authenticator, request: Request, answer: Response, user: UserRecord, device: str) -> None:
+    """Mark a browser after a login by password, a known one anew."""
+    made, life_s = auth.people.new_device(user, device), int(DEVICE_LIFE.total_seconds())
+    tls = is_tls(request, behind_tls=auth.behind_tls)
+    answer.set_cookie(auth.device_cookie(user.name), made, life_s, path="/login", httponly=True, samesite="strict", secure=tls)
 
 
 def _set_cookie(auth: Authenticator, request: Request, answer: Response, secret: str) -> None:

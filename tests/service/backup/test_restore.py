@@ -17,6 +17,7 @@ import pytest
 from abbe.service.backup.backup import file_list
 from abbe.service.cli import run
 from abbe.service.runs.exchange import import_folder
+from abbe.service.storage.engine import head_revision
 from abbe.service.storage.store import Store
 from tests.scenarios.campaign_files import measured, write_folder
 from tests.service.backup.conftest import Shop, new_machine_file
@@ -121,11 +122,12 @@ def test_a_damaged_file_is_named_and_nothing_restored(made: Path, elsewhere: Pat
     assert [path.name for path in elsewhere.parent.iterdir()] == ["machine.toml"]
 
 
-def _edited(made: Path, statement: str) -> None:
+def _edited(made: Path, *statements: str) -> None:
     """By somebody who makes the list anew as well."""
     with closing(sqlite3.connect(made / "abbe.sqlite3")) as database:
         database.execute("DROP TRIGGER audit_no_delete")
-        database.execute(statement)
+        for statement in statements:
+            database.execute(statement)
         database.commit()
     doc = json.loads((made / "backup.json").read_text())
     (made / "backup.json").write_text(json.dumps(doc | {"files": {name: asdict(one) for name, one in file_list(made).items() if one}}))
@@ -150,6 +152,15 @@ def test_what_was_changed_on_purpose_is_refused(
     assert err.count("\n") == 1
     assert told in err
     assert [path.name for path in elsewhere.parent.iterdir()] == ["machine.toml"]
+
+
+def test_a_backup_of_the_first_schema_is_brought_up_to_date(made: Path, elsewhere: Path) -> None:
+    first = "ALTER TABLE users DROP COLUMN pin", "ALTER TABLE users DROP COLUMN pin_failures"
+    _edited(made, *first, "UPDATE alembic_version SET version_num = '0100'")
+    assert run(["restore", "-m", str(elsewhere), str(made)]) == 0
+    with Store.open(f"sqlite:///{elsewhere.parent / 'abbe.sqlite3'}") as store:
+        assert store.health().revision == head_revision()
+        assert store.people.all() == []
 
 
 def test_without_its_key_it_is_asked_for(shop: Shop, tmp_path: Path, elsewhere: Path, capsys: pytest.CaptureFixture[str]) -> None:

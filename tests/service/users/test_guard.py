@@ -327,8 +327,20 @@ async def test_a_known_browser_is_forgotten_with_the_password(world: World) -> N
     assert world.people.device_of("ana", device) == ""
 
 
-async def test_a_known_browser_keeps_its_cookie(gate: Gate) -> None:
-    first = await log_in(gate, "a-viewer", PHRASE)
-    gate.client.cookies.set("abbe-device-677529ba", first.cookies["abbe-device-677529ba"], path="/login", domain="127.0.0.1")
-    assert "abbe-device-677529ba" not in (await log_in(gate, "a-viewer", PHRASE)).cookies
+async def test_a_known_browser_keeps_its_id_and_its_90_days_begin_anew_with_each_login_by_password(gate: Gate) -> None:
+    people, clock = gate.world.people, gate.world.clock
+    first = (await log_in(gate, "a-viewer", PHRASE)).cookies["abbe-device-677529ba"]
+    clock.later(days=89)
+    gate.client.cookies.set("abbe-device-677529ba", first, path="/login", domain="127.0.0.1")
+    second = (await log_in(gate, "a-viewer", PHRASE)).cookies["abbe-device-677529ba"]
+    assert people.device_of("a-viewer", second) == people.device_of("a-viewer", first) != ""
+    clock.later(days=2)
+    assert people.device_of("a-viewer", second) != ""
+    assert people.device_of("a-viewer", first) == "", "the browser keeps a cookie as long as it likes"
+    label, end_s, seal = first.split(".")
+    assert people.device_of("a-viewer", f"{label}.{int(end_s) + 999_999}.{seal}") == ""
+    gate.client.cookies.set("abbe-device-677529ba", second, path="/login", domain="127.0.0.1")
+    people.set_pin("a-viewer", "582914")
+    by_pin = await gate.ask("POST", "/login", data={"name": "a-viewer", "pin": "582914"}, headers=OWN)
+    assert (by_pin.status_code, "abbe-device-677529ba" in by_pin.cookies) == (303, False)
     assert "abbe-device-a5c643bc" in (await log_in(gate, "a-operator", PHRASE)).cookies

@@ -12,7 +12,7 @@ import pytest
 
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.users.lockout import MOST, Buckets, Lockout, LoginOrigin
-from abbe.service.users.people import ANONYMOUS, AT_A_TIME, Passwords, digest_of
+from abbe.service.users.people import ANONYMOUS, AT_A_TIME, MOST_WRONG_PINS, Passwords, UserAccounts, digest_of
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.users.conftest import PHRASE, World
 
@@ -151,6 +151,59 @@ def test_somebody_always_manages_users(world: World) -> None:
     world.people.add("root2", "admin", PHRASE)
     world.people.disable("root")
     assert world.people.check("root", PHRASE) is None
+
+
+def test_ten_wrong_pins_in_a_row_remove_the_pin_over_any_time_and_restart(world: World) -> None:
+    world.people.add("olga", "operator", PHRASE)
+    world.people.set_pin("olga", "582914")
+
+    def tries(count: int) -> list[bool]:
+        found = []
+        for _ in range(count):
+            people = UserAccounts(world.store, world.clock, world.people.passwords)  # as after a restart
+            user, removed = people.check_pin("olga", "000000")
+            assert user is None
+            found.append(removed)
+            world.clock.later(days=1)
+        return found
+
+    assert tries(9) == [False] * 9
+    assert world.people.check_pin("olga", "582914")[0] is not None, "a right one ends the row"
+    assert tries(10) == [False] * 9 + [True]
+    assert world.people.with_pin() == []
+    assert world.people.check_pin("olga", "582914") == (None, False)
+    world.people.set_pin("olga", "582914")
+    assert tries(1) == [False]
+
+
+def test_simultaneous_guesses_of_a_pin_get_ten_hashes_of_it(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    world.people.add("olga", "operator", PHRASE)
+    world.people.set_pin("olga", "582914")
+    barrier, count, checked, verify = threading.Barrier(16, timeout=10), world.store.people.count_pin, [], world.people.passwords.verify
+
+    def met(user_id: int) -> int:
+        barrier.wait()  # all have found the user with the PIN
+        return count(user_id)
+
+    def seen(kept: str | None, pin: str) -> bool:
+        checked.append(kept)
+        return verify(kept, pin)
+
+    monkeypatch.setattr(world.store.people, "count_pin", met)
+    monkeypatch.setattr(world.people.passwords, "verify", seen)
+    with ThreadPoolExecutor(16) as pool:
+        answers = list(pool.map(lambda n: world.people.check_pin("olga", f"{n:06}"), range(16)))
+    assert [user for user, _ in answers] == [None] * 16
+    assert len([kept for kept in checked if kept is not None]) == MOST_WRONG_PINS
+    assert world.people.with_pin() == []
+
+
+def test_wrong_pins_do_not_delay_the_password(world: World) -> None:
+    lockout = Lockout(world.clock.monotonic_s)
+    for _ in range(9):
+        lockout.failed("olga", LoginOrigin("10.0.0.1", "panel", pin=True))
+    assert lockout.wait_s("olga", LoginOrigin("10.0.0.1", "panel", pin=True)) > 0
+    assert lockout.wait_s("olga", LoginOrigin("10.0.0.1", "panel")) == 0
 
 
 def test_no_more_than_two_hashes_at_a_time() -> None:

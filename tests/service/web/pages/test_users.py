@@ -138,6 +138,26 @@ def test_a_pin_logs_in_where_the_password_did_before_and_nowhere_else(alone: Ser
         for _ in range(5):
             log_in(alone, panel, "olga", pin="000000")
         assert log_in(alone, panel, "olga", pin="582914") == 429, "a PIN waits as a password does"
+        assert log_in(alone, panel, "olga", password=PHRASE) == 303, "the password does not wait for PINs"
+    told = [r.outcome for r in alone.store.audit.events() if r.target == "olga, by PIN"]
+    assert told == ["refused 401", "done 303"] + ["refused 401"] * 5
+
+
+def test_ten_wrong_pins_remove_the_pin_and_the_audit_says_so(alone: Served) -> None:
+    alone.people.set_pin("olga", "582914")
+    alone.auth.recorded_refusals._burst = 0.0  # a flood of refusals: only what was done is recorded
+    with httpx.Client(base_url=alone.base) as panel:
+        assert log_in(alone, panel, "olga", password=PHRASE) == 303
+        for _ in range(10):
+            alone.auth.lockout._counts.clear()  # as an hour later
+            answer = panel.post("/login", data={"name": "olga", "pin": "000000"}, headers={"Origin": alone.base})
+            assert answer.status_code == 401
+        assert "it was removed after 10 wrong ones" in answer.text
+        assert 'value="olga"' not in answer.text
+        assert log_in(alone, panel, "olga", pin="582914") == 401
+        assert log_in(alone, panel, "olga", password=PHRASE) == 303
+    told = [(r.action, r.outcome) for r in alone.store.audit.events() if r.target == "user olga: PIN removed after 10 wrong ones"]
+    assert told == [("POST /login", "done")]
 
 
 def test_who_proposes_approves_or_manages_has_no_pin_and_a_new_password_removes_it(alone: Served) -> None:
