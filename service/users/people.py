@@ -225,6 +225,7 @@ class UserAccounts:
             return None
         if self.passwords.outdated(user.password):
             self._store.people.change(user.id, keep_session=True, password=self.passwords.hash(password))
+            return self._store.people.find(name)  # the cookie of the browser is sealed with the new hash
         return user
 
     def check_pin(self, name: str, pin: str) -> tuple[UserRecord | None, bool]:

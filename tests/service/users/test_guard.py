@@ -13,7 +13,7 @@ from fastapi import FastAPI, Request
 from starlette.responses import StreamingResponse
 
 from abbe.service.errors import AbbeError, StoreError
-from abbe.service.users.people import IDLE
+from abbe.service.users.people import IDLE, Passwords
 from abbe.service.users.roles import Permission
 from abbe.service.web.app import as_in_host_header, create_app
 from abbe.service.web.login.access import needs
@@ -325,6 +325,14 @@ async def test_a_known_browser_is_forgotten_with_the_password(world: World) -> N
     assert world.people.device_of("bob", device) == world.people.device_of("nobody", device) == ""
     world.people.set_password("ana", PHRASE + "!")
     assert world.people.device_of("ana", device) == ""
+
+
+async def test_a_browser_stays_known_when_the_login_makes_a_new_hash(world: World) -> None:
+    world.people.add("ana", "operator", PHRASE)
+    world.people.passwords = Passwords(memory_kib=128, passes=1)
+    ana = world.people.check("ana", PHRASE)
+    assert ana is not None
+    assert world.people.device_of("ana", world.people.new_device(ana)) != ""
 
 
 async def test_a_known_browser_keeps_its_id_and_its_90_days_begin_anew_with_each_login_by_password(gate: Gate) -> None:
