@@ -14,7 +14,7 @@ from abbe.service.domain.progress import MachineReading
 SHORTEST_S = 0.2
 """Shortest time between two positions from which a feed is computed, s."""
 OLD_S = 5.0
-"""An answer of the laser that is older, s, is not shown."""
+"""An answer that is older, s, is not shown."""
 MM_PER_COUNT = 1e-7
 MM_MIN_PER_MM_US = 6e7
 
@@ -26,26 +26,40 @@ class LatestReading:
         self._session, self._clock, self._now_s = session, clock, now_s
         self._before: ControllerStatus | None = None
         self._feed_mm_min: float | None = None
+        self._stamps: dict[str, tuple[float, float]] = {}
 
     def __call__(self) -> MachineReading | None:
-        """The latest state; None before the controller's first answer. The feed is that of the path between two positions (chord)."""
+        """The latest state; the feed is that of the path between two positions (chord).
+
+        None before the controller's first answer, if the last one is older than `OLD_S`, and if a position is not finite.
+        """
         status = latest_status(self._session.controller)
-        if status is None:
+        if status is None or self._is_old(status.host_s) or not all(math.isfinite(x) for x in status.position_mm):
             return None
         self._note_feed(status)
         laser = None if self._session.laser is None else latest_reading(self._session.laser)
-        if laser is not None and self._now_s() - laser.host_s > OLD_S:
+        if laser is not None and self._is_old(laser.host_s):
             laser = None
         return MachineReading(
-            at_ms=1e3 * (self._clock.utc().timestamp() - (self._now_s() - status.host_s)),
+            at_ms=self._utc_ms("controller", status.host_s),
             position_mm=status.position_mm,
             feed_mm_min=self._feed_mm_min if status.moving else 0.0,
             override_percent=status.override_percent,
             door_open=Condition.DOOR_OPEN in status.conditions,
             air_c=None if laser is None else _finite(laser.air_temp_c),
+            laser_at_ms=None if laser is None else self._utc_ms("laser", laser.host_s),
             laser_mm=None if laser is None else laser.displacement_tenth_nm * MM_PER_COUNT,
             beam_good=laser is not None and beam_is_good(laser.status),
         )
+
+    def _is_old(self, host_s: float) -> bool:
+        return self._now_s() - host_s > OLD_S
+
+    def _utc_ms(self, of: str, host_s: float) -> float:
+        """UTC of an answer, computed once: the page tells a new answer by its time."""
+        if of not in self._stamps or self._stamps[of][0] != host_s:
+            self._stamps[of] = host_s, 1e3 * (self._clock.utc().timestamp() - (self._now_s() - host_s))
+        return self._stamps[of][1]
 
     def _note_feed(self, status: ControllerStatus) -> None:
         before = self._before
@@ -53,7 +67,7 @@ class LatestReading:
             return
         if before is not None and status.ctrl_us > before.ctrl_us:
             way_mm = math.dist(status.position_mm, before.position_mm)
-            self._feed_mm_min = way_mm / (status.ctrl_us - before.ctrl_us) * MM_MIN_PER_MM_US
+            self._feed_mm_min = _finite(way_mm / (status.ctrl_us - before.ctrl_us) * MM_MIN_PER_MM_US)
         self._before = status
 
 

@@ -82,7 +82,7 @@ class MachineReading:
     """The machine during a measurement, from answers that the measurement asked for. None: not known.
 
     ``at_ms``: when the controller answered, UTC milliseconds; ``position_mm``: of the axes; ``feed_mm_min``: along the chord between two
-    positions; ``air_c``: air temperature at the laser; ``laser_mm``: count of the laser, valid only while ``beam_good``.
+    positions; ``air_c``: air temperature at the laser; ``laser_mm``: count of the laser at ``laser_at_ms``, valid only while ``beam_good``.
     """
 
     at_ms: float
@@ -91,6 +91,7 @@ class MachineReading:
     override_percent: Number
     door_open: bool
     air_c: float | None
+    laser_at_ms: float | None
     laser_mm: float | None
     beam_good: bool
 

@@ -236,6 +236,7 @@ setInterval(() => {
   if (!shows) return;
   if (now !== "over") setText("live-elapsed", span(Number(root.dataset.elapsed) + performance.now() / 1000));
   showLeft();
+  machine.hideOld();
   const stale = old || (traces.running ? performance.now() - lastFrame > OLD_MS : !machine.hasLaser);
   find("live-pair").classList.toggle("old", stale);
   if (traces.running) setText("live-note", stale ? words["live.old"] : "");

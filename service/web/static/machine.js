@@ -3,11 +3,23 @@
 import { colours } from "./traces.js";
 
 const MINUTE_MS = 60_000;
+// The core shows no answer that is older; here it is counted from the arrival, since the clocks of panel and service may differ.
+const OLD_MS = 5000;
 const find = (id) => document.getElementById(id);
 
 function setText(id, text) {
   const element = find(id);
   if (element && element.textContent !== text) element.textContent = text;
+}
+
+function isNew(last, at) {
+  if (at === last.at) return false;
+  Object.assign(last, { at, seen: performance.now() });
+  return true;
+}
+
+function isOld(last) {
+  return performance.now() - last.seen > OLD_MS;
 }
 
 export class Machine {
@@ -18,10 +30,13 @@ export class Machine {
     this.finer = this.mm > 1 ? 2 : 0;
     this.readings = [];
     this.canvas = find("strip");
+    this.answer = { at: null, seen: -Infinity };
+    this.laser = { at: null, seen: -Infinity };
   }
 
   show(reading) {
-    find("dro").hidden = reading === null;
+    if (reading !== null) isNew(this.answer, reading.at_ms);
+    find("dro").hidden = reading === null || isOld(this.answer);
     if (reading === null) return;
     for (const [k, axis] of ["x", "y", "z"].entries()) setText(`dro-${axis}`, (reading.position_mm[k] / this.mm).toFixed(3 + this.finer));
     const feed = reading.feed_mm_min === null ? "–" : (reading.feed_mm_min / this.mm).toFixed(this.finer);
@@ -29,13 +44,18 @@ export class Machine {
     setText("dro-door", this.words[reading.door_open ? "live.door.open" : "live.door.shut"]);
     find("dro-door").classList.toggle("fail", reading.door_open);
     setText("dro-air", reading.air_c === null ? "–" : `${reading.air_c.toFixed(1)} °C`);
-    if (reading.laser_mm === null || !reading.beam_good) return;
-    this.readings.push([reading.at_ms, reading.laser_mm / this.mm]);
-    while (this.readings[0][0] < reading.at_ms - MINUTE_MS) this.readings.shift();
+    if (reading.laser_mm === null || !reading.beam_good || !isNew(this.laser, reading.laser_at_ms)) return;
+    this.readings.push([reading.laser_at_ms, reading.laser_mm / this.mm]);
+    while (this.readings[0][0] < reading.laser_at_ms - MINUTE_MS) this.readings.shift();
+  }
+
+  // Without a new answer the last one is not the machine any more.
+  hideOld() {
+    if (isOld(this.answer)) find("dro").hidden = true;
   }
 
   get hasLaser() {
-    return this.readings.length > 1;
+    return this.readings.length > 1 && !isOld(this.laser);
   }
 
   // A path begins, or another test: the laser counts from another zero.

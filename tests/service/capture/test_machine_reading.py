@@ -59,7 +59,7 @@ def test_the_feed_is_the_way_between_two_positions_and_none_at_standstill() -> N
 
 
 def test_the_laser_is_told_while_its_answer_is_new() -> None:
-    _, laser, session, reading = told()
+    cnc, laser, session, reading = told()
     asyncio.run(session.controller.status())
     asyncio.run(session.need_laser().peek())
     now = reading()
@@ -71,6 +71,51 @@ def test_the_laser_is_told_while_its_answer_is_new() -> None:
     lost = reading()
     assert lost is not None
     assert not lost.beam_good
+    cnc.answer = replace(STATUS, host_s=106.0)
+    asyncio.run(session.controller.status())
     late = LatestReading(session, SystemClock(), lambda: 106.0)()
     assert late is not None
-    assert (late.air_c, late.laser_mm, late.beam_good) == (None, None, False)
+    assert (late.air_c, late.laser_at_ms, late.laser_mm, late.beam_good) == (None, None, None, False)
+
+
+def test_an_answer_of_the_controller_that_is_old_is_not_told() -> None:
+    _, _, session, _ = told()
+    asyncio.run(session.controller.status())
+    assert LatestReading(session, SystemClock(), lambda: 105.0)() is not None
+    assert LatestReading(session, SystemClock(), lambda: 105.1)() is None
+    assert LatestReading(session, SystemClock(), lambda: 3700.0)() is None
+
+
+def test_every_answer_keeps_its_own_time() -> None:
+    cnc, _, session, _ = told()
+    now_s = [100.0]
+    reading = LatestReading(session, SystemClock(), lambda: now_s[0])
+    asyncio.run(session.controller.status())
+    asyncio.run(session.need_laser().peek())
+    first = reading()
+    now_s[0] = 102.0
+    cnc.answer = replace(STATUS, host_s=101.0)
+    asyncio.run(session.controller.status())
+    second = reading()
+    assert first is not None
+    assert second is not None
+    assert second.laser_at_ms == first.laser_at_ms
+    assert second.at_ms != first.at_ms
+
+
+@pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
+def test_a_position_that_is_not_finite_is_not_told(bad: float) -> None:
+    cnc, _, session, reading = told()
+    cnc.answer = replace(STATUS, position_mm=(1.0, bad, 3.0))
+    asyncio.run(session.controller.status())
+    assert reading() is None
+
+
+def test_positions_so_far_apart_that_the_feed_is_not_finite_have_none() -> None:
+    cnc, _, session, reading = told()
+    for ctrl_us, x_mm in ((1_000_000, -1.5e308), (1_500_000, 1.5e308)):
+        cnc.answer = replace(STATUS, ctrl_us=ctrl_us, position_mm=(x_mm, 0.0, 0.0))
+        asyncio.run(session.controller.status())
+        last = reading()
+    assert last is not None
+    assert last.feed_mm_min is None

@@ -110,6 +110,7 @@ CORE = [
             override_percent=100,
             door_open=False,
             air_c=20.5,
+            laser_at_ms=None,
             laser_mm=None,
             beam_good=False,
         ),

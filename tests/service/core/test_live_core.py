@@ -59,8 +59,8 @@ async def test_the_machine_is_told_while_it_is_measured_and_then_that_it_is_not(
     feed = LiveFeed()
     showing = asyncio.create_task(show_live(core, feed, SystemClock()))
     reading = MachineReading(
-        at_ms=0.0, position_mm=(1.0, 2.0, 3.0), feed_mm_min=600.0, override_percent=100, door_open=False, air_c=20.5, laser_mm=None,
-        beam_good=False,
+        at_ms=0.0, position_mm=(1.0, 2.0, 3.0), feed_mm_min=600.0, override_percent=100, door_open=False, air_c=20.5,
+        laser_at_ms=None, laser_mm=None, beam_good=False,
     )  # fmt: skip
     with feed.showing(lambda: reading):
         for _ in range(2):
