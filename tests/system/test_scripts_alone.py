@@ -69,3 +69,45 @@ def test_a_refused_live_connection_is_told(chromium: Browser) -> None:
         answered(seen.page, base, [screen(root, script="live")], [])
         seen.page.goto(f"{base}/live")
         seen.page.wait_for_selector("#live-lost:not([hidden])", timeout=15_000)
+
+
+@pytest.mark.parametrize("answer", ["refused", "another screen"])
+def test_a_report_that_could_not_be_made_is_told_with_a_way_to_try_again(chromium: Browser, answer: str) -> None:
+    base = f"http://127.0.0.1:{free_port()}"
+    waits = '<p>It follows</p><p hidden>It could not be made <a href="/run?id=1">Try again</a></p>'
+    main = f'<section data-run="1"><canvas></canvas></section><div id="run-report" data-from="/whole" aria-busy="true">{waits}</div>'
+    with browser(chromium) as seen:
+        answered(seen.page, base, [screen(main, script="late"), screen("<h1>Log in</h1>", script="late")], [])
+        if answer == "refused":
+            seen.page.route(f"{base}/whole", lambda route: route.fulfill(status=503, body=""))
+        seen.page.goto(f"{base}/run?id=1")
+        seen.page.wait_for_selector("#run-report:not([aria-busy]) a")
+        assert seen.page.inner_text("#run-report").strip() == "It could not be made Try again"
+
+
+def test_the_machine_disappears_when_it_says_nothing_new_and_a_reading_of_the_laser_is_drawn_once(chromium: Browser) -> None:
+    base = f"http://127.0.0.1:{free_port()}"
+    dro = "".join(f'<dd id="dro-{name}"></dd>' for name in ("x", "y", "z", "feed", "door", "air"))
+    main = f'<dl id="dro" hidden>{dro}</dl><canvas id="strip"></canvas><section id="live" data-mm="1"></section>'
+    tell = """async ([at, laserAt]) => {
+      const { Machine } = await import('/static/machine.js');
+      const machine = (globalThis.machine ??= new Machine(document.getElementById('live'), {}));
+      const reading = { at_ms: at, position_mm: [1, 2, 3], feed_mm_min: 0, override_percent: 100, door_open: false, air_c: null };
+      machine.show({ ...reading, laser_at_ms: laserAt, laser_mm: laserAt, beam_good: true });
+      machine.hideOld();
+      return [!document.getElementById('dro').hidden, machine.readings.map(([when]) => when), machine.hasLaser];
+    }"""
+    with browser(chromium) as seen:
+        page = seen.page
+        page.clock.install()
+        answered(page, base, [screen(main, script="pad")], [])
+        page.goto(f"{base}/live")
+        page.clock.pause_at("2030-01-01")
+        assert page.evaluate(tell, [1.0, 10.0]) == [True, [10.0], False]
+        assert page.evaluate(tell, [2.0, 10.0]) == [True, [10.0], False], "the reading is the same one"
+        assert page.evaluate(tell, [3.0, 11.0]) == [True, [10.0, 11.0], True]
+        page.clock.fast_forward(4900)
+        assert page.evaluate(tell, [3.0, 11.0]) == [True, [10.0, 11.0], True]
+        page.clock.fast_forward(200)
+        assert page.evaluate(tell, [3.0, 11.0]) == [False, [10.0, 11.0], False], "an old answer is not shown again by being told again"
+        assert page.evaluate(tell, [4.0, 11.0]) == [True, [10.0, 11.0], False]

@@ -75,10 +75,26 @@ async function showBar(status) {
   shownBar = next;
 }
 
+// A kept page has no token: it asks for that of the session first. Null: the service cannot be reached.
+async function stopAnswer(button) {
+  if (!button.dataset.csrf) {
+    const session = await ask("/api/v1/session", true);
+    if (!session.ok) return session;
+    button.dataset.csrf = (await session.json()).csrf_token;
+  }
+  const headers = { "X-CSRF-Token": button.dataset.csrf };
+  return fetch("/api/v1/stop", { method: "POST", headers, signal: AbortSignal.timeout(PATIENCE_MS) });
+}
+
+// Until then a kept page is not replaced, so that the answer to Stop can be read.
+let readUntil = 0;
+
 // Stop stays in its place and works with a session that has run out; the answer stands beside it.
 async function stop(button) {
   const show = (text) => setText("stop-answer", text);
-  const answer = await fetch("/api/v1/stop", { method: "POST", headers: { "X-CSRF-Token": button.dataset.csrf } }).catch(() => null);
+  readUntil = Infinity;
+  const answer = await stopAnswer(button).catch(() => null);
+  readUntil = performance.now() + PATIENCE_MS;
   if (answer?.ok) show(words["strip.stopped"]);
   else show(words[answer === null ? "strip.unreached" : answer.status === 409 ? "strip.nothing" : "strip.failed"]);
 }
@@ -102,7 +118,7 @@ async function replaceContent(next) {
   revision = next;
 }
 
-const LOST = banner.textContent;
+const LOST = banner.dataset.text ?? banner.textContent;
 // Set by the service worker: this page comes from its store, since the service could not be reached.
 const kept = document.documentElement.dataset.kept;
 let seen = new Date(kept ?? Date.now());
@@ -138,7 +154,8 @@ async function refresh() {
       throw new Error(`status ${answer.status}`);
     }
     const status = await answer.json();
-    if (kept) { location.reload(); return; }
+    if (kept && performance.now() > readUntil) { location.reload(); return; }
+    if (kept) throw new Error("the answer to Stop is being read");
     seen = new Date();
     // The screen of an unavailable core has no revision: reload it, now that the core answers.
     if (revision === "") { location.reload(); return; }
