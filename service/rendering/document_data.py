@@ -123,8 +123,8 @@ WORDS = (
     "page {n} of {m}",
 )  # fmt: skip
 """Words of the templates."""
-NAMES = frozenset(("Machine", "Campaign", "Run", "Laboratory", "Customer", "Authorised by", "Approved by"))
-"""Facts whose values are names: they are never translated."""
+NAMES = frozenset(("Machine", "Campaign", "Run", "File", "Authorised by", "Approved by"))
+"""Facts and columns whose values are names: they are never translated. The facts of a certificate are told where they are made."""
 
 
 def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
@@ -157,16 +157,27 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
     return told | {"words": {word: phrase(document.lang, word) for word in WORDS}}
 
 
-def _told(lang: str, value: Any, key: str = "") -> Any:
-    """Texts in a language; pictures tell theirs when they are drawn."""
+def _told(lang: str, value: Any, key: str = "", head: Any = None) -> Any:
+    """Texts in a language; pictures tell theirs when they are drawn. ``head``: of a table with these rows."""
     if lang == ENGLISH or key in {"kind", "sign", "layout", "lang", "format", "svgs", "number"}:
         return value
+    if key == "facts":
+        return [fact | {"name": phrase(lang, fact["name"])} for fact in value]
+    if key == "rows" and isinstance(head, list):
+        return [[v if name in NAMES else phrase(lang, v) for name, v in zip(head, row, strict=True)] for row in value]
     if isinstance(value, dict):
         named = value.get("name") in NAMES and "value" in value
-        return {k: v if named and k == "value" else _told(lang, v, k) for k, v in value.items()}
+        told = {k: v if named and k == "value" else _told(lang, v, k, value.get("head")) for k, v in value.items()}
+        return told | ({"certificate": _certificate(lang, value["certificate"])} if "known" in value else {})
     if isinstance(value, list):
         return [_told(lang, v) for v in value]
     return phrase(lang, value) if isinstance(value, str) else value
+
+
+def _certificate(lang: str, text: str) -> str:
+    """What a person wrote about an instrument's certificate, and its last day in a language."""
+    written, mark, ours = text.rpartition("; ")
+    return written + mark + phrase(lang, ours)
 
 
 def _block(block: Block, draw: Callable[[str], str]) -> dict[str, Any]:

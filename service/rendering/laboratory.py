@@ -6,7 +6,7 @@ from typing import Any
 
 from abbe.service.domain.machine import Issuer
 from abbe.service.rendering.document import Document
-from abbe.service.rendering.phrases import ENGLISH
+from abbe.service.rendering.phrases import ENGLISH, phrase
 
 TITLE = "Calibration certificate"
 OF_MEASUREMENTS = ("run", "campaign", "verification")
@@ -20,13 +20,14 @@ PLACES = {"laboratory": "in the laboratory", "customer": "at the customer's", "l
 def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
     """Return number, facts, statements and missing facts of a certificate; None without a laboratory or without a measurement.
 
+    Values of facts are in the document's language, as far as they are ours: what people wrote stays as it is.
     ``digest``: SHA-256 of the report. The number is made from it, so equal results have the same number.
     """
     issuer = document.issuer
     if issuer is None or document.kind not in OF_MEASUREMENTS:
         return None
     number = issuer.prefix + "-".join(digest[k : k + 4] for k in (0, 4, 8))
-    facts = {"Number": number, **_parties(issuer), **_what(document, issuer), "Authorised by": issuer.person}
+    facts = {"Number": number, **_parties(document.lang, issuer), **_what(document, issuer), "Authorised by": issuer.person}
     pairs = [{"name": name, "value": value} for name, value in facts.items() if value]
     missing = _missing(document, issuer)
     return {
@@ -38,23 +39,23 @@ def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
     }
 
 
-def _parties(issuer: Issuer) -> dict[str, str]:
+def _parties(lang: str, issuer: Issuer) -> dict[str, str]:
     town = f"{issuer.city}, {issuer.country}"
     return {
         "Laboratory": ", ".join(one for one in (issuer.laboratory, issuer.address, town) if one),
-        "Accreditation": issuer.accreditation or "none is claimed",
+        "Accreditation": issuer.accreditation or phrase(lang, "none is claimed"),
         "Customer": ", ".join(one for one in (issuer.customer or issuer.laboratory, issuer.customer_address) if one),
     }
 
 
 def _what(document: Document, issuer: Issuer) -> dict[str, str]:
-    item, days = document.item, document.days
+    item, days, lang = document.item, document.days, document.lang
     named = [document.about.get("Machine", "")]
     if item is not None:
-        named += [item.maker, item.model, f"serial {item.serial}" if item.serial else ""]
-    place = ", ".join(one for one in (PLACES.get(issuer.place, ""), "" if item is None else item.place) if one)
-    when = "" if days is None else days[0] if days[0] == days[1] else f"{days[0]} to {days[1]}"
-    methods = ", ".join(dict.fromkeys(figure.method for figure in document.figures if figure.method))
+        named += [item.maker, item.model, phrase(lang, "serial {n}").format(n=item.serial) if item.serial else ""]
+    place = ", ".join(one for one in (phrase(lang, PLACES.get(issuer.place, "")), "" if item is None else item.place) if one)
+    when = "" if days is None else days[0] if days[0] == days[1] else phrase(lang, f"{days[0]} to {days[1]}")
+    methods = ", ".join(dict.fromkeys(phrase(lang, figure.method) for figure in document.figures if figure.method))
     return {
         "Item": ", ".join(one for one in named if one),
         "Place of calibration": place,

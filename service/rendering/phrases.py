@@ -1,9 +1,9 @@
 """Translate English sentences (stored verdicts and remarks, reports, pictures) to the reader's language.
 
 A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the braces
-is translated by the same rules. It never contains the end of a sentence; if its name has one letter, it contains no blanks. A phrase has no
-full stop at its end. A text without a pattern is split into sentences and their parts, and each part is tried; a part without a pattern
-stays English. Tests search all screens and reports for texts without a pattern.
+is translated by the same rules; that of `NAMED` is not. It never contains the end of a sentence; if its name has one letter, it contains
+no blanks. A phrase has no full stop at its end. A text without a pattern is split into sentences and their parts, and each part is tried; a
+part without a pattern stays English. Tests search all screens and reports for texts without a pattern.
 """
 
 from __future__ import annotations
@@ -22,6 +22,8 @@ ENGLISH = "en"
 LANGUAGES = (ENGLISH, "de", "ja", "ko")
 LONGEST = 2000
 """Longer texts are no sentences."""
+NAMED = frozenset(("campaign", "file", "machine", "run", "setup", "who"))
+"""Places that hold names which people gave, without a semicolon."""
 _PLACE = re.compile(r"\{(\w+)\}")
 _SHOWN = re.compile(r'>([^<>]+)<|aria-label="([^"]*)"')
 _WORD = re.compile("[A-Za-z]{2}|/")
@@ -56,7 +58,7 @@ def _phrases(lang: str) -> tuple[dict[str, str], tuple[_Pattern, ...]]:
 
 def _pattern(key: str, told: str) -> _Pattern:
     parts = _PLACE.split(key)
-    places = {part: r"\S+?" if len(part) == 1 else r"(?:(?!\. ).)+?" for part in parts[1::2]}
+    places = {part: r"\S+?" if len(part) == 1 else rf"(?:(?!{'[.;]' if part in NAMED else '[.]'} ).)+?" for part in parts[1::2]}
     text = "".join(re.escape(part) if k % 2 == 0 else f"(?P<{part}>{places[part]})" for k, part in enumerate(parts))
     return _Pattern(parts[0], parts[-1], re.compile(text, re.DOTALL), told)
 
@@ -86,7 +88,8 @@ def _fitting(lang: str, text: str) -> str | None:
         if text.startswith(one.head) and text.endswith(one.tail):
             found = one.fits.fullmatch(text)
             if found is not None:
-                return one.told.format(**{name: phrase(lang, value) for name, value in found.groupdict().items()})
+                values = found.groupdict().items()
+                return one.told.format(**{name: value if name in NAMED else phrase(lang, value) for name, value in values})
     return None
 
 

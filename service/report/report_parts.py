@@ -56,7 +56,7 @@ def instruments(runs: Sequence[Run], campaign: Doc, rules: Rules) -> list[Instru
 
 def _certificate(kind: str, rules: Rules) -> str:
     if rules.calibrated_until is None:
-        return "not in the data; a machine file (-m) states it"
+        return "not in the data: a machine file (-m) states it"
     day, known = rules.calibrated_until.get(kind), rules.instruments.get(kind, "")
     valid = "none stated in the machine file" if day is None else f"valid to {day.isoformat()}"
     return f"{known}; {valid}" if known else valid

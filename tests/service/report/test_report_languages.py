@@ -13,11 +13,12 @@ from typing import Any
 import pypdf
 import pytest
 
+from abbe.service.domain.machine import Item
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.effects.model_book import REMEDIES
 from abbe.service.errors import FileFormatError
 from abbe.service.rendering import document_page
-from abbe.service.rendering.document import Document
+from abbe.service.rendering.document import Document, Instrument, Section, TextTable
 from abbe.service.rendering.document_data import document_json, shown
 from abbe.service.rendering.document_page import document_html, document_pdf, write_document
 from abbe.service.rendering.laboratory import TRANSLATION
@@ -126,6 +127,33 @@ def test_names_stay_names() -> None:
     """A machine called Table and a customer called Limit are no words to be told."""
     plain = Document(kind="run", title="t", about={"Machine": "Table", "Campaign": "Limit", "Feed": "10 to 20 mm/min"}, lang="de")
     assert [one["value"] for one in shown(plain)["about"]] == ["Table", "Limit", "10 bis 20 mm/min"]
+
+
+@pytest.mark.parametrize("lang", OTHERS)
+def test_names_that_people_gave_stay_in_sentences_tables_and_certificates(lang: str, reports: dict[str, Document]) -> None:
+    for text in ("Campaign {}", "Run {}", "run {}: no data", "push 3 of machine {}", "accepted by {} at 2026-11-27"):
+        told = phrase(lang, text.format("before"))
+        assert "before" in told
+        assert told != text.format("before")
+    table = Section("Runs", [TextTable(("Run", "State"), [("test", "no data")])])
+    plain = Document(kind="run", title="t", about={"File": "table"}, sections=[table], lang=lang)
+    assert shown(plain)["about"][0]["value"] == "table"
+    assert shown(plain)["sections"][0]["blocks"][0]["rows"] == [["test", phrase(lang, "no data")]]
+    one = reports["certificate"]
+    assert one.issuer is not None
+    typed = {"accreditation": "none", "place": "customer", "prefix": "test", "procedure": "before; limit"}
+    issuer = one.issuer.model_copy(update=typed)
+    item = Item(maker="Limit", model="table", serial="before", place="test")
+    bar = Instrument("Ball-bar", "test; before; valid to 2027-01-31", "nothing stated")
+    made = shown(replace(one, lang=lang, issuer=issuer, item=item, instruments=[bar]))
+    facts = {fact["name"]: fact["value"] for fact in made["certificate"]["facts"]}
+    wanted = phrase(lang, "serial {n}").format(n="before")
+    assert facts[phrase(lang, "Item")].endswith(f"Limit, table, {wanted}")
+    assert facts[phrase(lang, "Place of calibration")] == phrase(lang, "at the customer's") + ", test"
+    assert facts[phrase(lang, "Accreditation")] == "none"
+    assert facts[phrase(lang, "Number")].startswith("test")
+    assert facts[phrase(lang, "Procedure")].startswith("before; limit")
+    assert made["instruments"][0]["certificate"] == "test; before; " + phrase(lang, "valid to 2027-01-31")
 
 
 def words(text: str) -> set[str]:
