@@ -201,7 +201,7 @@ def _import(store: Store, folder: Path, campaign: str, site: Site, runs: list[di
 
 def _broken_run(store: Store, campaign: str, evil: str) -> None:
     number = store.runs.start(store.campaigns.find(campaign).id, f"late{evil}", "ballbar_circle", "identify", {"setup": {}})
-    store.runs.finish(number, "stopped", f"SEQ-003: the auth was opened{evil}", None)
+    store.runs.finish(number, "stopped", f"SEQ-003: the door was opened{evil}", None)
 
 
 def _proposals(store: Store, site: Site, runs: list[dict[str, Any]], solved: Solved, campaign: str, solution: int, evil: str) -> list[int]:

@@ -101,7 +101,7 @@ def test_the_sample_of_a_certificate(filled: Filled) -> None:
 def test_the_report_of_the_demonstration(page: Page, tmp_path: Path) -> None:
     abbe("demo", "--keep", tmp_path / "demo")
     page.goto((tmp_path / "demo" / "report.html").as_uri())
-    kept(page, "before-after", tmp_path, 950)
+    kept(page, "before-after", tmp_path, 950, page.locator("h2", has_text="Before and after"))
     kept(page, "diagonals", tmp_path, 510, page.locator("svg", has_text="along the diagonal"))
 
 
