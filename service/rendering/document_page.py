@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cache
 from importlib.resources import files
@@ -45,6 +45,11 @@ IN_ENGLISH = (
     "This report is in English: its language ({lang}) has no font on this computer. Install fonts-noto-cjk, or run deploy/npm_files.py."
 )
 _EAST = re.compile("[\u1100-\u11ff\u2e80-\ua4cf\uac00-\ud7ff\uf900-\ufaff\uff00-\uffef]")
+_OWN = {
+    "ja": re.compile("[\u3040-\u30ff\u31f0-\u31ff\uff66-\uff9f]"),
+    "ko": re.compile("[\u1100-\u11ff\u3130-\u318f\ua960-\ua97f\uac00-\ud7ff]"),
+}
+"""Letters that only the fonts of a language hold: kana and Hangul; Chinese characters are in either."""
 
 
 def document_html(document: Document) -> str:
@@ -67,10 +72,11 @@ def document_pdf(document: Document) -> bytes:
         remark, document = IN_ENGLISH.format(lang=document.lang), replace(document, lang=ENGLISH)
     data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
     folders = [*dict.fromkeys(folder for found in known.values() for folder in found)]
-    if _EAST.search(json.dumps(data, ensure_ascii=False)):
+    text = json.dumps(data, ensure_ascii=False)
+    if _EAST.search(text):
         first = sorted(FONTS_OF, key=lambda lang: lang != document.lang)
         data |= {"font": [FONT, *(name for lang in first for name in FONTS_OF[lang][1]), "Noto Sans CJK SC"]}
-        remark = remark or ("" if folders else phrase(document.lang, NO_FONT))
+        remark = remark or ("" if _printable(text, known) else phrase(document.lang, NO_FONT))
     else:
         folders = []
     data["remarks"] = [*filter(None, [remark]), *data["remarks"]]
@@ -80,6 +86,11 @@ def document_pdf(document: Document) -> bytes:
     made = typst.compile(template, format="pdf", font_paths=fonts, sys_inputs=inputs)
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
+
+
+def _printable(text: str, known: Mapping[str, list[str]]) -> bool:
+    """Whether the fonts of these languages hold the East Asian letters of a text."""
+    return any(known.values()) and all(known[lang] or not own.search(text) for lang, own in _OWN.items())
 
 
 def font_folders(lang: str) -> list[str]:

@@ -111,6 +111,19 @@ def test_limits_are_judged_with_the_guard_band(value, word, sign):
     assert verdict_of(found, ["the air ...: the figures cannot be judged"], ("open", "", ""))[:2] == ("open", "Cannot tell")
 
 
+@pytest.mark.parametrize(
+    ("font", "printed", "missing"),
+    [("MPLUS1p_400Regular.ttf", ("基準", "きじゅん"), "공작기계"), ("NanumGothic_400Regular.ttf", ("基準", "공작기계"), "フライス")],
+)
+def test_a_font_of_one_language_does_not_print_the_letters_of_the_other(monkeypatch, tmp_path, font, printed, missing):
+    monkeypatch.setattr(document_page, "FONTS", (str(tmp_path),))
+    monkeypatch.delenv("ABBE_FONTS", raising=False)
+    (tmp_path / font).touch()
+    for title in printed:
+        assert "".join(NO_FONT.split()) not in pdf_text(document_pdf(document(title=title)))
+    assert "".join(NO_FONT.split()) in pdf_text(document_pdf(document(title=missing)))
+
+
 def test_east_asian_names_have_a_font_or_the_report_says_that_there_is_none(monkeypatch, tmp_path):
     named = document(title="基準 공작기계")
     monkeypatch.setattr(document_page, "FONTS", (str(tmp_path),))
