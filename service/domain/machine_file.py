@@ -12,8 +12,8 @@ from abbe.service.domain.bounds import Number, Text, Word
 
 Origin = Literal["default", "file", "environment"]
 MOST_VALUES = 5000
-ABOUT_BYTES = 200
-"""JSON of a record beside its texts of any length, at most."""
+ABOUT_BYTES = 80
+"""JSON of a value beside its texts, at most."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,7 +37,7 @@ class MachineFileSummary:
 
     def within(self, most_bytes: int) -> MachineFileSummary:
         """As many values as fit into so many bytes of JSON, first those of the file and the environment, then defaults."""
-        kept, room = set[int](), most_bytes - len(json.dumps(self.path)) - ABOUT_BYTES
+        kept, room = set[int](), most_bytes - len(json.dumps(self.path)) - 4 * ABOUT_BYTES
         for k in sorted(range(len(self.values)), key=lambda k: self.values[k].origin == "default"):
             one = self.values[k]
             room -= len(json.dumps([one.key, one.value], ensure_ascii=False).encode()) + ABOUT_BYTES
