@@ -31,7 +31,9 @@ class People(Repository):
 
         def work(connection: Connection) -> int:
             fresh = dialect_insert(connection, users).values(name=name, role=role, password=password, created_utc=self._db.now())
-            number = connection.execute(fresh.on_conflict_do_nothing().returning(users.c.id)).scalar()
+            once = fresh.on_conflict_do_nothing().returning(users.c.id)  # two may add one name at the same time
+            taken = connection.execute(select(users.c.id).where(users.c.name == name)).first() is not None
+            number = None if taken else connection.execute(once).scalar()
             if number is None:
                 raise UserRefused(f"there is a user {name!r} already", "give another name")
             return int(number)

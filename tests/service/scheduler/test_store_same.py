@@ -242,6 +242,7 @@ def allowed(ask: Any) -> None:
         ask.people.revoke_token(1),
         ask.people.tokens(),
     )
+    ask.people.count_pin(2), ask.people.count_pin(2)
     ask.people.change(1, role="viewer", disabled_utc="then"), ask.people.session("7" * 64), ask.people.active_admins(), ask.people.all()
     said = AuditEvent(who="anna", action="table.push", target="mill-7", outcome="done", doc=DOC)
     record = replace(said, id=1, utc="then", digest="1" * 64, key="k" * 16, mac="m" * 64)
