@@ -36,7 +36,7 @@ SHORT = words(
 )
 CODES = (
     r"CAL-[-0-9a-f]+",
-    r"[0-9a-f]{16,}",
+    r"[0-9a-f]{16,}(?:\+changes)?",
     r"[0-9a-f]{4}(?:-[0-9a-f]{4})+",
     r"[A-Z]{3}-\d+",
     r"E[XYZABC][XYZ](?:\.\d+)?",

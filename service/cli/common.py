@@ -1,4 +1,4 @@
-"""Shared by commands: how machine and database are named, and output for people and for programs."""
+"""Shared by commands: sorted help and ``--out``, how machine and database are named, and output for people and for programs."""
 
 from __future__ import annotations
 

@@ -1,8 +1,9 @@
-"""Subtract the effect of an active compensation table beyond smooth corrections from a campaign's readings.
+"""Subtract from a campaign's readings what a new table must not correct: side effects of the table in force, and effects of other remedies.
 
-The table is known exactly, from the controller or the database. Its moves of the axes suffer lost motion, and interpolation and rounding
-add to them: both effects are subtracted. The machine's lost motion is solved first, preferably without step diagonals, in which the table
-alone moves axes that are commanded to rest.
+Of a table in force, all beyond smooth corrections is subtracted. It is known exactly, from the controller or the database. Its moves of
+the axes suffer lost motion, and interpolation and rounding add to them: both effects are subtracted. The machine's lost motion is solved
+first, preferably without step diagonals, in which the table alone moves axes that are commanded to rest. A table that is not available
+widens the covariance instead (`with_unknown_table`).
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """The push journal: orders, one chained entry for every transition, the facts that entries state, and the journal in the database.
 
 The journal is also the audit trail: an entry that is changed, removed or swapped breaks the chain. An entry is on disk before the operation
-that it permits is done.
+that it permits is done. `Capabilities`: what a control can do, as its commissioning proved.
 """
 
 from __future__ import annotations
