@@ -20,7 +20,7 @@ from abbe.models.arrays import F1
 BLOCKS = 200
 LOWEST = 24
 MANY = 100
-"""Number of smallest delays that give the exponent of the delay distribution near its lower end; `LOWEST` if there are few points."""
+"""Number of smallest delays from which the exponent of the delay distribution is estimated; with few points, `LOWEST` delays."""
 LEAST_PAIRS = 2 * LOWEST + 2
 EARLY = 3.0
 """If one arrival lies below the line of all others by more than this many times their 24th smallest delay, its time stamp is wrong."""
@@ -31,7 +31,7 @@ SURE = 10.0
 """Smallest step that is detected, as a multiple of the scatter of the blocks' smallest delays."""
 LEAST_STEP_S = 1e-3
 SIDE = 4
-"""Minimum number of blocks on either side of a step; fewer late blocks at an end count as a spike of the delays."""
+"""Minimum number of blocks on either side of a step; fewer late blocks at the beginning or the end are a spike of the delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,8 +39,8 @@ class Constants:
     """Table of the error of a lower envelope of delays with a power-law distribution, in units of the 24th smallest delay.
 
     ``shape``: estimated exponents, one per column of the table. ``bias``: how much too high the line lies in its middle. ``half``: half the
-    width of the 95.45 % interval of the error in the middle. ``tilt``: the same for the rise from end to end. Simulated on 40 000 and
-    60 000 clouds with exponents 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
+    width of the 95.45 % interval of the error in the middle. ``tilt``: half the width of this interval for the rise of the line from end to
+    end. Simulated on 40 000 and 60 000 clouds with exponents 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
 
     shape: tuple[float, ...]
@@ -149,7 +149,7 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ClockFit:
-    """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, the shortest delay subtracted.
+    """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, without the shortest delay.
 
     ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time in this middle, ``u_rate`` of
     the rate, ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number left

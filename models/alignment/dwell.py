@@ -13,12 +13,12 @@ import numpy as np
 from abbe.models.arrays import F1
 
 GAP = 7.0
-"""Cost of a place or a standstill without a partner: minus the logarithm of the probability (one in a thousand)."""
+"""Cost of a place or a standstill without a partner: minus the logarithm of its probability, which is one in a thousand."""
 SURE = 3.0
 """An assignment that costs at most this much more than the best one counts as equally good."""
 NEAR, LARGEST_MM = 0.75, 2.0
-"""Largest change of the deviation from one place to the next: as a share of the distance to the nearest other place that may be approached
-from the same side, and absolute."""
+"""Largest change of the deviation from one place to the next: a share of the distance to the nearest other place that may be approached
+from the same side, but at most a constant."""
 SAME = 0.25
 """Two standstills are at one place if they differ by less than this share of that largest change."""
 BASE_MM, PER_MM, TURN_MM = 1e-3, 3e-5, 1e-2
@@ -241,7 +241,7 @@ def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
 
 
 TOLERANCE = 0.3
-"""A change between two standstills without motion is a jump, up to this share of the smallest planned move."""
+"""If the reading changes between two standstills without motion, the change is a jump, up to this share of the smallest planned move."""
 LONG, SHORT = 1.8, 0.4
 """A standstill is reported if it is more than LONG times or less than SHORT times as long as planned."""
 JUMP_SAMPLES = 2

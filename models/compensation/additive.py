@@ -33,7 +33,7 @@ DIAGONAL_WEIGHT = 1.0
 DIAGONAL_POINTS = 33
 
 Field = Callable[[F2], F3]
-"""From positions, shape (n, 3), to values, shape (n, 3 directions, m): the deviation per unit of m coefficients, or one field (m = 1)."""
+"""Function of positions (n, 3) that returns the deviation per unit of m coefficients, or one field (m = 1), shape (n, 3 directions, m)."""
 
 
 def additive_design(

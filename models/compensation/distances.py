@@ -18,7 +18,7 @@ from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.sources import ErrorSources, approach_variance_mm2, error_sources, joint_factor
 
 Correction = Callable[[F2], F2]
-"""From commanded positions, shape (n, 3), to the corrections that are added to them, shape (n, 3), mm."""
+"""Function of commanded positions (n, 3), mm, that returns the corrections to be added to them, shape (n, 3), mm."""
 
 
 INNER_SHARE = 0.8

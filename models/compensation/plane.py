@@ -1,7 +1,8 @@
 """One-axis tables from a deviation that is known in a part of the strokes only: in planes at one or several heights, or in a box.
 
-The axes that span it correct each other in the directions that were sensed. Beyond the known part the tables hold their end values. This is
-an assumption, as are the values at other positions of an axis that no plane spans. A direction that was not sensed is not corrected.
+The axes that span this part correct each other in the directions that were sensed. Beyond the known part the tables hold their end values.
+This is an assumption, as are the values at other positions of an axis that no plane spans. A direction that was not sensed is not
+corrected.
 """
 
 from __future__ import annotations

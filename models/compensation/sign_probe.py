@@ -135,7 +135,7 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
     wanted = np.eye(3)[axis]
     name = AXES[axis]
     if 2.0 * u.max() > 0.5 * allowed * max(1.0, float(np.abs(moved).max())):
-        return f"{name}: the uncertainty of the response is {200.0 * u.max():.0f} % (k = 2), which proves nothing; repeat the step"
+        return f"{name}: the response has an uncertainty of {200.0 * u.max():.0f} % (k = 2) and proves nothing; repeat the step"
     if (np.abs(moved - wanted) <= allowed).all():
         return ""
     main = int(np.argmax(np.abs(moved)))
@@ -155,7 +155,8 @@ def _fault(axis: int, moved: F1, u: F1, allowed: float) -> str:
 
 SHOWN = 3
 OBSERVED_MM = 0.003
-"""An axis whose tables change no reading by this much, mm, is not observed: drift within the tolerance could hide a reversed sign."""
+"""An axis counts as observed only if its tables change some reading by at least this much, mm: drift within the tolerance could hide the
+reversed sign of a smaller change."""
 
 
 @dataclass(frozen=True)

@@ -17,13 +17,13 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.probability import f_above
 
 LAGS = 10
-"""Lags over which the autocorrelation of the whitened noise is summed: at the last, the usual memory (`instrument_noise.MEMORY`) has fallen
-to 6 %, and more lags would add mainly noise."""
+"""Lags over which the autocorrelation of the whitened noise is summed. At the last lag the usual correlation (`instrument_noise.MEMORY`)
+has fallen to 6 %; more lags would add mainly noise."""
 BLOCKS, SHORTEST = 12, 8
-"""Blocks per run: they resolve up to six periods, and eight or more remain after cup and length are fitted. Readings in the shortest block:
-the usual memory has fallen to a tenth there, so block sums are nearly independent."""
+"""Blocks per run, and readings in the shortest block. The blocks resolve up to six periods, and eight or more degrees of freedom remain
+after cup and length are fitted. Over a block the usual correlation falls to a tenth, so block sums are nearly independent."""
 FREE_MM = 1.0
-"""Wide prior of a run's own unknowns."""
+"""Prior standard deviation of a run's own unknowns, mm: so wide that it leaves them free."""
 NO_NOISE = "the noise of the instrument cannot be estimated from the fitted runs"
 TOO_FEW = "too few of their readings count"
 

@@ -265,7 +265,7 @@ class ChangeContext:
         return self._beside([t if t.asked.several else replace(t, size=max(LINEAR_SIZES)) for t in (*others, *linear)])
 
     def size(self, chosen: Chosen, asked: AskedChange) -> tuple[float, float]:
-        """Return the value of a change and its standard uncertainty, units as in `Change`, estimated with all scales and squareness."""
+        """Return value and standard uncertainty of a change in the units of `Change`; all scales and squareness errors are fitted, too."""
         coefficients, covariance = self._coefficients(chosen, asked)
         if not asked.several:
             direction = self.known.linear({asked.name: 1.0})
@@ -303,7 +303,7 @@ class ChangeContext:
     def hidden(self, chosen: Chosen) -> dict[str, float]:
         """Bound on the change of each scale (m/m) and squareness (rad) that was not chosen: |estimate| + U (k = 2), all fitted together.
 
-        One whose U exceeds the largest size tried is left out, because these runs cannot show it.
+        A change whose U exceeds the largest size tried is left out, because these runs cannot show it.
         """
         names = {t.asked.name for t in chosen.taken}
         out = {}
@@ -376,7 +376,8 @@ class Change:
     Attributes
     ----------
     name : str
-        ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for the whole motion (of positioning: without the scale).
+        ``"EXX"`` ... ``"A0Z"`` for a scale or squareness, ``"EYX shape"`` for the shape of a whole motion (of a positioning motion: without
+        its scale).
     value, u : float
         Change and its standard uncertainty, estimated together with all scales and squareness errors. Scale: m/m; squareness: rad; shape:
         rms over the stroke, mm or rad. ``u`` includes the old solution's uncertainty.

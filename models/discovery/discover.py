@@ -26,11 +26,11 @@ from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, lin
 from abbe.models.effects.effect import Effect
 
 MOST_GATED = 0.35
-"""If more than this share of all readings creeps (stick-slip), none is excluded from the search for mean effects."""
+"""Readings that a stick-slip makes scatter are excluded from the search for mean effects, unless they reach this share of all readings."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
-"""A rival replaces a named effect when it explains more by this chi-square; a new name needs the same margin."""
+"""A rival replaces a named effect if it lowers chi-square by this much more; a new name needs the same margin."""
 ROUNDS = 3
 """Maximum number of repetitions of the search, each with noise and simulation refitted beside the findings."""
 
@@ -52,7 +52,7 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """Remove variance effects from a problem: project vibrations out of each ball-bar run, and give loud readings weight 0."""
+    """Remove variance effects from a problem: project vibrations out of each ball-bar run, and give the scattering readings weight 0."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":

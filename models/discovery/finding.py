@@ -53,26 +53,28 @@ TIME_TRUE_TO_FORM = 0.3
 RESIDUE_SHARE = 0.001
 """A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
-"""Stick-slip, vibration and outliers of the bar are residues below this share of the strongest mean effect, on any axis: below 1 % of an
-effect with corners or waves (`ROUGH`), below 0.3 % of a smooth one, which leaves less that looks like scatter (a true stick-slip had 1.0 %
-of a pitch error)."""
+"""Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
+this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
+less like scatter. A true stick-slip had 1.0 % of a pitch error."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""Effects at the reversals of one axis differ only in form: with less than `AXIS_SHARE` of its evidence, one is a residue of another."""
+"""Effects at the reversals of one axis differ only in form: one with less than `AXIS_SHARE` of another's evidence is a residue of that
+one."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.03
 CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
 LAG = ("contour_lag", "servo_mismatch")
 SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Groups of related effects (thermal courses, curves over the position, lags of drives): a deviation of one from its formula by a sixth,
-3 % of its evidence, resembles another of the group. In 345 cases (150 others for lags) ten false names had 0.2 to 2.9 % of the evidence of
-the strong effect, and one true name 9 %."""
+"""Groups of related effects: thermal courses, curves over the position, lags of drives. If an effect deviates from its formula by a sixth
+(3 % of its evidence), the deviation resembles another effect of the group. In 345 cases (150 others for lags) ten false names had 0.2 to
+2.9 % of the evidence of the strong effect; one true name had 9 %."""
 REST_SHARE = 0.1
-"""A name with less than this share of the evidence that nothing explains is a residue of that: whatever is unknown resembles some name a
-little. In cases whose effects were all found, nothing is left."""
+"""If part of the gap has no explanation, a name with less than this share of its evidence is a residue of it: an unknown effect always
+resembles some name a little. In cases whose effects were all found, no such part remains."""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name with less than this share of another's evidence, and more than this overlap of their signals, is a residue of the other."""
+"""A name is a residue of another if its evidence is below the first share of the other's and their signals overlap by more than the
+second."""
 STARTS = 2000.0
 """Assumed number of starts compared in a campaign, to bound the p-value of the best."""
 
@@ -269,9 +271,9 @@ def finding(
 
 
 def doubted(found: Discovery, mixed: MixedUp) -> Discovery:
-    """Replace a result by the suspicion that some readings have the wrong label. No effect is named until that is settled."""
+    """Replace a result by the suspicion that some readings have the wrong label. No effect is named before this is settled."""
     whose = " and ".join(mixed.runs)
-    doubt = f"the readings of {whose} are probably {mixed.how}: put right, {mixed.remains:.0%} of the misfit of all runs remains"
+    doubt = f"the readings of {whose} are probably {mixed.how}: after the correction, {mixed.remains:.0%} of the misfit of all runs remains"
     location = Localization(runs=mixed.runs, table=found.location.table)
     return replace(
         found, verdict="unknown", doubt=doubt, location=location, next_test=None, rejected=(), agreement=(), unjudged=(), unseen=()
@@ -299,7 +301,7 @@ def _judge(
     names = [*mean.values(), *scatter]
     small = {e.label: e.evidence for e in names if e.evidence < REST_SHARE * rest}
     left = {
-        label: f"{nats:.0f} nats, where {rest:.0f} have no explanation: it may be only a part of these" for label, nats in small.items()
+        label: f"{nats:.0f} nats, but {rest:.0f} nats have no explanation: it may be only a part of them" for label, nats in small.items()
     }
     left = {**residues(names, frozenset(e.label for e in scatter)), **left}
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
@@ -440,7 +442,8 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
-    """Count the residuals of named scatter in the fitted runs as noise of all roles: scatter cannot be predicted, so it closes no gap."""
+    """Count the scatter of variance effects in the fitted runs as noise of all roles: it cannot be predicted, so naming it closes no
+    gap."""
     fitted = gaps["identify"]
     scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)
     return {role: replace(g, floor_mm=float(np.sqrt(g.floor_mm**2 + scatter))) for role, g in gaps.items()}

@@ -14,24 +14,25 @@ from abbe.models.arrays import F1, F2
 from abbe.models.effects.path import Path
 
 SHARE, MEMORY = 0.1, 0.75
-"""Share of the variance with memory, and its correlation from reading to reading; typical of ball-bars and interferometers in a workshop
-(long-run variance 1.6 times that of one reading)."""
+"""Correlated share of the noise variance, and its correlation from reading to reading: usual values of ball-bars and interferometers in a
+workshop, with which the long-run variance is 1.6 times that of one reading."""
 SHARES, MEMORIES = (0.1, 0.3, 0.5, 0.7, 0.85, 0.95), (0.5, 0.75, 0.9, 0.96, 0.985)
-"""Colours tried for noise that remembers more than usual, such as 1/f noise."""
+"""Shares and correlations tried for noise with more correlation than usual, such as 1/f noise."""
 REMEMBERS, MOST, LOUDEST = 60.0, 0.8, 4.0
 SAME_MM, AGAIN = 1.0, 0.2
-"""Runs follow the same path if they are never farther apart; mean correlation of their residuals from which these are not noise."""
+"""Runs that are never farther apart than `SAME_MM` follow the same path. If their residuals correlate by `AGAIN` on average, these are not
+noise."""
 CLEARLY = 0.85
-"""The noise from differences of neighbours is used if it is less than this fraction of the residuals' standard deviation."""
+"""The noise from differences of neighbours is used if it is below this fraction of the residuals' standard deviation."""
 FINE, QUIET, SHORTEST = 4, 0.25, 24
-"""Order of the differences of neighbours that show the noise even of an incomplete model (a wave of eight readings adds 0.5 %); share of an
-instrument's runs that may be quieter than its noise, because effects reach the other runs; and readings that a run must have."""
+"""`FINE`: order of the differences of neighbours; these show the noise even of an incomplete model, for example a missing wave of eight
+readings adds 0.5 %. `QUIET`: share of an instrument's runs that effects leave quiet. `SHORTEST`: readings that a run must have."""
 CROWD, TURN_MM, CREEP_MM_S = 0.35, 3.0, 4.5
-"""Share of eleven neighbours from which off readings are a disturbance, no accident; travel after a reversal that a spike
-takes; speed below which an axis may stick and slip."""
+"""`CROWD`: if a larger share of eleven neighbours is off, they are a disturbance, not single wrong readings. `TURN_MM`: travel after a
+reversal in which a spike ends. `CREEP_MM_S`: speed below which an axis may stick and slip."""
 LOW = 1.2
-"""Relative error of the noise of one run of n readings over 1/sqrt(n), at the share `QUIET` of noise alone: 0.67 times 1.17 (of a median)
-times 1.5 (differences share readings)."""
+"""Relative bias of the noise found by `fine`, in units of 1/sqrt(n) for n readings: even without effects, the run at the share `QUIET` has
+less noise than the average run. Product of 0.67 (quartile), 1.17 (median) and 1.5 (differences share readings)."""
 LONE = 7.0
 """A reading farther from its neighbours than this many standard deviations does not count."""
 

@@ -30,14 +30,14 @@ CHANCE = 1e-3
 FEWEST, REPEATS = 8, 20
 """Minimum number of readings for judging a single run, and of repeats for estimating noise."""
 SHARED = 6
-"""Readings for one degree of freedom of the noise from neighbours' differences, which share readings and whose median is taken."""
+"""Readings per degree of freedom of the noise from differences of neighbours: the differences share readings, and their median is taken."""
 NEAR_MM = 0.05
 """Positions closer than this are repeats of one position."""
 ALONG_ONE_AXIS = 0.999
-"""A laser measures along one axis if that component of its beam is larger."""
+"""A laser measures along one axis if this component of its beam's unit vector is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
-"""Least shares of the residuals' energy: to report them as alike in both directions; to report a period."""
+"""Least share of the residuals' energy for reporting them as alike in both directions, and for reporting a period."""
 
 
 @dataclass(frozen=True)

@@ -24,9 +24,9 @@ REMAINS = 0.6
 ALONE = 0.5
 """... and no correction of other runs explains this share of what the best one explains."""
 SAME_MM = 0.5
-"""Tools that differ by less are one tool, and a shorter component has no sign."""
+"""Tool vectors that differ by less are one tool; a component below this size has no sign that could be wrong."""
 EXCESS = 0.4
-"""A tool's sign is wrong if less than this share of the misfit above the noise remains with it put right ..."""
+"""A tool's sign is wrong if its correction leaves less than this share of the misfit above the noise ..."""
 CLEAR = 60.0
 """... and chi-square becomes smaller by more than this."""
 

@@ -33,7 +33,7 @@ UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
 """Price of a name that contains a simpler one (`abbe.models.effects.effect.Effect.variant_of`), equal to the price of a new name."""
 FORM_LEAST = 0.0002
-"""A freedom of form must explain at least this share of its effect's gain; a smaller one would only shift the strength."""
+"""A form (`Form`) must explain at least this share of its effect's gain; a smaller one would only shift the strength."""
 NEARLY = 0.93
 """A name that explains this share of the gain of a structure without a name is preferred to it."""
 HOPELESS = 0.5
@@ -41,14 +41,14 @@ HOPELESS = 0.5
 UNNAMED_LABELS = 40
 """Number of labels of structures without a name that are tried (`abbe.models.discovery.generic.unnamed_structures`)."""
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
-"""Price of a freedom of form of a chosen effect: this share of the price of its columns, plus a constant."""
+"""Price of a form (`Form`) of a chosen effect: this share of the price of its columns, plus a constant."""
 APART = 0.06
 """Least relative distance of a second effect's parameter from that of the first, and from the harmonics of this."""
 SIDE_BAND = 0.03
 """A second wave nearer to the first than twice `APART`, with less than this share of its score, is a side band: the first wave's amplitude
 changes along the axis in another way than its forms allow."""
 UNSURE = 3.84
-"""Chi-square below the best up to which a moment is not excluded (95 %)."""
+"""A moment is not excluded if its chi-square gain is lower than the best by at most this (95 %)."""
 EXCLUDED = 12.0
 """A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8

@@ -40,25 +40,25 @@ def declaration_faults(effect: Effect) -> tuple[str, ...]:
     texts = {n: getattr(effect, n) for n in ("title", "needs", "signature", "remedy_text", "source")}
     low, high = effect.typical
     checks = [
-        (bool(NAME.fullmatch(effect.name)), f"name {effect.name!r}: lower-case letters, digits and _ expected"),
-        (bool(effect.keys) and len(set(effect.keys)) == len(effect.keys), f"keys {effect.keys}: at least one, each only once, expected"),
-        (all(KEY.fullmatch(k) for k in effect.keys), f"keys {effect.keys}: X, EYX, EAX, XY, ZX, YZ or nothing expected"),
-        (effect.unit in UNITS, f"unit {effect.unit!r}: one of {', '.join(UNITS)} expected"),
+        (bool(NAME.fullmatch(effect.name)), f"name {effect.name!r}: expected lower-case letters, digits and _"),
+        (bool(effect.keys) and len(set(effect.keys)) == len(effect.keys), f"keys {effect.keys}: expected one key or more, each only once"),
+        (all(KEY.fullmatch(k) for k in effect.keys), f"keys {effect.keys}: expected X, EYX, EAX, XY, ZX, YZ or nothing"),
+        (effect.unit in UNITS, f"unit {effect.unit!r}: expected one of {', '.join(UNITS)}"),
         (effect.per_unit > 0.0, f"per_unit {effect.per_unit}: must be positive"),
-        (0.0 < low <= high, f"typical {effect.typical}: two positive numbers, the smaller first, expected"),
-        (effect.family in get_args(Family), f"family {effect.family!r}: one of {', '.join(get_args(Family))} expected"),
-        (effect.remedy in get_args(Remedy), f"remedy {effect.remedy!r}: one of {', '.join(get_args(Remedy))} expected"),
-        (effect.kind in ("mean", "variance"), f"kind {effect.kind!r}: mean or variance expected"),
-        (set(effect.blind) < set(TESTS), f"blind {effect.blind}: only names from {', '.join(TESTS)}, and not all of them, expected"),
+        (0.0 < low <= high, f"typical {effect.typical}: expected two positive numbers, the smaller first"),
+        (effect.family in get_args(Family), f"family {effect.family!r}: expected one of {', '.join(get_args(Family))}"),
+        (effect.remedy in get_args(Remedy), f"remedy {effect.remedy!r}: expected one of {', '.join(get_args(Remedy))}"),
+        (effect.kind in ("mean", "variance"), f"kind {effect.kind!r}: expected mean or variance"),
+        (set(effect.blind) < set(TESTS), f"blind {effect.blind}: expected names from {', '.join(TESTS)}, but not all of them"),
         (
             all(set(v) <= set(ADDS) and v for v in effect.separated_by.values()),
-            f"separated_by: for each rival one or more of {', '.join(ADDS)} expected",
+            f"separated_by: expected one or more of {', '.join(ADDS)} for each rival",
         ),
         *((bool(text.strip()), f"{n}: must not be empty") for n, text in texts.items()),
         *(
             (
                 p.low <= min(p.starts) <= max(p.starts) <= p.high and p.low <= p.typical <= p.high and p.low < p.high,
-                f"parameter {p.name}: low < high, and typical and all starts between them, expected; got {p}",
+                f"parameter {p.name}: expected low < high, with typical and all starts between them; got {p}",
             )
             for p in effect.shape
         ),
@@ -90,7 +90,7 @@ def _faults(effect: Effect, signal: Signal, paths: tuple[Path, ...], key: str, v
     columns = signal(paths, key, values)
     shape = [np.shape(c) for c in columns]
     if len(columns) != len(paths) or any(len(s) != 2 or s[0] != p.n or s[1] != shape[0][1] for s, p in zip(shape, paths, strict=False)):
-        return [f"one array of shape (readings, coefficients) per run expected, with equally many coefficients; got shapes {shape}"]
+        return [f"expected one array of shape (readings, coefficients) per run, with equally many coefficients; got shapes {shape}"]
     if not all(np.isfinite(c).all() for c in columns):
         return ["a value is not finite"]
     out = [

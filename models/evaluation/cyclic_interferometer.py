@@ -20,10 +20,10 @@ ORDERS = (1, 2)
 BLOCKS = 24
 SECTORS = 12
 LEAST_SECTORS = 9
-"""Of the sectors of a fringe, as many must hold samples."""
+"""Sectors of a fringe that must hold samples, out of `SECTORS`."""
 LEAST_SAMPLES = 4 * BLOCKS
 BISQUARE, ROUNDS = 4.685, 20
-"""Tukey's constant, in robust standard deviations, and how often weights are found anew."""
+"""Tukey's constant, in robust standard deviations, and the largest number of times that the weights are computed again."""
 GRID: F1 = np.arange(256.0) * (2.0 * np.pi / 256.0)
 TREND = 3
 """Degree of the polynomial that a linear run may have beside the cyclic error."""
@@ -102,7 +102,7 @@ def from_quadrature(x: F1, y: F1, fringe: float) -> CyclicError:
 
 
 def from_linear_run(reading: F1, deviation: F1, fringe: float) -> CyclicError:
-    """Fit waves of an interferometer's ``reading`` (n,), and a smooth trend, to its ``deviation`` (n,) from a reference, same unit.
+    """Fit waves and a smooth trend to the ``deviation`` (n,) of an interferometer's ``reading`` (n,) from a reference, both in one unit.
 
     Raises
     ------

@@ -20,7 +20,8 @@ BINS = 360
 FULL_RAD = np.deg2rad(350.0)
 """A path that covers less is an arc (`OnePath.is_whole`), whose least squares centre is less certain."""
 ZONE_POINTS = 2000
-"""Most readings for the minimum zone; of a longer path, the highest and the lowest of each of `ZONE_POINTS` / 2 stretches count."""
+"""Largest number of readings for the minimum zone. A longer path is cut into `ZONE_POINTS` / 2 stretches; their highest and lowest readings
+count."""
 
 
 @dataclass(frozen=True, slots=True)

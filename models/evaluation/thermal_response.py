@@ -32,14 +32,14 @@ SENSITIVITIES_MM = tuple(1e-3 * v for v in (0.5, 1, 2, 4, 8, 16, 32))
 OFFSETS_MM = tuple(1e-3 * v for v in (0.1, 0.3, 1, 2, 3, 4, 6, 9, 14, 20))
 SCATTERS_MM = tuple(1e-3 * v for v in (0.1, 0.2, 0.5, 1, 1.5, 2, 3, 4, 6, 9, 14))
 WIDE_MM = 1.0
-"""Prior of the displacement at 20 degrees C and of a shift: it says nothing."""
+"""Prior standard deviation of the displacement at 20 degrees C and of a shift: so wide that it leaves them free."""
 CHANCE = 0.01
 """A shift of several runs is claimed below this p-value, which counts all tried beginnings and ends."""
 LEAST_RUNS = 5
 UNLIKELY = 7.0
-"""A time constant whose evidence is so much less than the best does not count: one in a thousand."""
+"""A time constant does not count if its log evidence is lower than the best by more than this: odds of one to a thousand."""
 LEAST_U_MM = 1e-5
-"""Reading and temperatures are not better known."""
+"""Least standard uncertainty of a predicted displacement: reading and temperatures are not known better."""
 
 Grid = tuple[float, float, float, float]
 """Prior of a sensitivity (mm/K), offset of a run (mm), scatter (mm), memory of the scatter (s)."""

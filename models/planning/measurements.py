@@ -31,7 +31,7 @@ READING_S = 0.4
 CLEARANCE_MM = 10.0
 """Laser paths keep this distance from the ends of the strokes."""
 BAR_VALUES = 400
-"""Block means that the solution uses of one ball-bar run."""
+"""Number of block means to which the solution reduces one ball-bar run."""
 _FINE = 8
 BAR_CLEARANCE_MM = 5.0
 """Hemispheres keep this distance from the ends of the strokes, for approach, lost motion and cup offset."""

@@ -90,7 +90,7 @@ class MeasuringPlan:
     machine : Machine
     tools : Instruments
     steps : tuple of PlanStep
-        In the order of measuring: the set-up that gains most per minute comes first. One of them only judges (`judge`).
+        In the order of measuring: the set-up that gains most per minute comes first. One of them is the holdout run (`judge`).
     runs : tuple of RunData
         The runs of a perfect machine: positions, directions, times and weights of the block means, deviations zero.
     u_before_mm : tuple of two floats

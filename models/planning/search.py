@@ -49,9 +49,9 @@ Chosen = dict[str, tuple[Measurement, ...]]
 COVERAGE = 2.0
 """Coverage factor: U = 2 u."""
 JUDGE_SHARE = 0.05
-"""Largest share of the minutes that the run which only judges may take: it lowers no uncertainty."""
+"""Largest share of the minutes for the holdout run, which lowers no uncertainty."""
 JUDGE_LOSS = 0.1
-"""Largest relative increase of the plan's uncertainty for the sake of that run."""
+"""Largest relative increase of the plan's uncertainty for the sake of the holdout run."""
 LONGEST_MIN = 480.0
 """Longest plan considered, one day's work; for a goal that needs more, only the limit is reported (`Goal`)."""
 _FOREVER = 1e6

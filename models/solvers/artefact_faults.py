@@ -20,20 +20,21 @@ from abbe.models.solvers.observations import RunData
 
 Settle = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
 OTHER_PLACE_MM = 1.0
-"""A feature found farther from its nominal place is another one, if one lies there."""
+"""A feature found farther than this from its nominal place is taken for the feature that lies there, if one does."""
 NOISY, STRONG = 4.0, 25.0
-"""Poses are doubted if points scatter by this factor more than they repeat; least gain of log evidence to say so."""
+"""Poses are doubted if the scatter of their points is this many times the repeatability; least gain of log evidence that proves a fault."""
 STEP_MM, STEP_RAD = 0.02, 1e-4
 """Prior size of a motion of the artefact during a run."""
 QUIETER, GROSS_SIGMA = 1.5, 50.0
-"""Least factor by which the points of a run scatter less if it is parted, and what a gross one counts at most."""
+"""`QUIETER`: a run is parted if that divides the scatter of its points by this factor or more. `GROSS_SIGMA`: largest size, in standard
+deviations, with which one point counts in this scatter."""
 DOUBTED = 0.5
-"""A point of less weight is doubted."""
+"""A point whose robust weight is below this is doubted."""
 STEPS = np.array([STEP_MM] * 3 + [STEP_RAD] * 3)
 FALSE_TRIGGER_MM, FALSE_TRIGGERS = 0.01, 3
-"""A point off by more is a false trigger; more points of a run than these are none."""
+"""A point that is off by more than `FALSE_TRIGGER_MM` is a false trigger, unless the run has more than `FALSE_TRIGGERS` such points."""
 MOST = 0.3
-"""Least share of a form that its swirl makes."""
+"""Least share of an artefact's form that the rotation growing with r^2 must explain, for a twist to be named."""
 RADIUS_MM, TWIST_MM, SIGMA = 8e-3, 6e-3, 4.0
 """Least wrong radius and twist that are named, and by how many standard uncertainties they must differ from zero."""
 
@@ -246,8 +247,8 @@ def _radius(joint: JointSolution) -> list[ArtefactFault]:
     if abs(value) < max(RADIUS_MM, SIGMA * u):
         return []
     run = next(r.label for r in joint.data if r.points is not None and r.points.normal.any())
-    way = "large" if value < 0.0 else "small"
-    what = f"the radius of the stylus, with its pre-travel, is stated {1e3 * abs(value):.0f} ± {2e3 * u:.0f} µm too {way}"
+    way = "smaller" if value < 0.0 else "larger"
+    what = f"the radius of the stylus, with its pre-travel, is {1e3 * abs(value):.0f} ± {2e3 * u:.0f} µm {way} than stated"
     return [ArtefactFault(run, what, "solved for")]
 
 
@@ -266,8 +267,8 @@ def _twist(joint: JointSolution) -> list[ArtefactFault]:
         usual = float(np.linalg.norm((amount * joint.prior_sd)[form]))
         if abs(value) > max(TWIST_MM, SIGMA * u, 3.0 * usual) and _share(poses[0], places, e.theta, e.names, value) > MOST:
             what = (
-                f"a rotation growing with r² of {1e3 * value:+.1f} ± {2e3 * u:.1f} µm at the rim goes with the part in {len(poses)} poses: "
-                "form of the plate (a twist), as far as these poses say, not a motion of the machine"
+                f"a rotation that grows with r², {1e3 * value:+.1f} ± {2e3 * u:.1f} µm at the rim, turns with the part in "
+                f"{len(poses)} poses: as far as these poses show, it is form of the plate (a twist), not a motion of the machine"
             )
             out.append(ArtefactFault(mine[0][0].label, what, "left out of the machine"))
     return out

@@ -22,9 +22,9 @@ from abbe.models.solvers.observability.poses import NAMED, PoseRank, stated_plac
 
 COVERAGE = 2.0
 NATS = 5.0
-"""Least evidence for a field."""
+"""Least evidence, nats, for a field in part or machine."""
 LEAST_MM = 0.3e-3
-"""A smaller field is none, however sure."""
+"""A field below this size counts as none, however certain it is."""
 
 Verdict = Literal["with the part", "with the machine", "with both", "unknown", "none"]
 

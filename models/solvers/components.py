@@ -30,8 +30,8 @@ NOISE_SD = 2.0
 """Weak hyperprior of an instrument's log noise variance about the expected one: a factor of e in the standard deviation."""
 LEAST_ETA: F1 = np.array([0.0 if kind == "artefact" else -8.0 for kind in KINDS])
 """Least log ratio of noise variance to expected one by instrument. A factor of 55 in the standard deviation is below any resolution;
-readings without noise would drive it to minus infinity, and the normal equations beyond double precision. Points of artefacts state what
-they repeat: with a free form few poses would fit any scatter, the resolution of the touch included."""
+readings without noise would drive it to minus infinity, and the normal equations beyond double precision. The noise of an artefact's points
+is never below their stated repeatability: with a free form, few poses would fit any scatter, even that of the touch's resolution."""
 CLEAR = 1.5
 """Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25

@@ -22,16 +22,16 @@ from abbe.models.solvers.observations import RunData
 
 Solve = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
 NUGGETS, NOISY = 3.0, 1.4
-"""Positions get values of their own if the score for these exceeds its expectation by so many standard deviations, or if probed points
-scatter by this factor more than they repeat."""
+"""Positions get values of their own if the score for these exceeds its expectation by `NUGGETS` standard deviations, or if the scatter of
+probed points is `NOISY` times their repeatability."""
 PERIODS_MM = (4.0, 60.0)
 STEP_PER_MM = 2.5e-4
 """Range of the searched periods, and step of the searched frequencies."""
 LEADS_MM = (5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0)
 USUAL, SMOOTH, ALL_AXES = 0.7, 0.3, 0.7
-"""Prior probabilities: a period is the lead of a usual screw; there is none; all axes have the same."""
+"""Prior probabilities that a period is the lead of a usual screw, that there is no period, and that all axes have the same one."""
 LEAST, SURE = 0.05, 0.8
-"""A period takes part from this probability on; another one is searched for only after one of at least the second."""
+"""A period enters the model from the probability `LEAST` on; another one is searched for only if the last had at least `SURE`."""
 LARGEST = 4
 """Number of periods that are searched one after the other."""
 POLYNOMIAL = 5

@@ -47,8 +47,8 @@ class PlateFit:
         there = np.abs(self.value) > CLEAR * self.expanded
         if there[3]:
             return (
-                "unknown: rotation growing with r², with the part as far as one plate says; from one plate the machine (yaw, straightness) "
-                "cannot be excluded: measure a second plate made elsewhere on the table"
+                "unknown: one plate cannot show whether the rotation growing with r² belongs to the part or to the machine "
+                "(yaw, straightness); measure a second plate made elsewhere on the table"
             )
         if there.any():
             return f"{', '.join(n for n, t in zip(NAMES, there, strict=True) if t)} of machine and part together"

@@ -69,7 +69,7 @@ class StatedInputs:
             raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
 
     def as_measured(self) -> StatedInputs:
-        """The same inputs for a prediction at the measurement's temperature: scale temperature without uncertainty."""
+        """The same inputs for a prediction at the temperature of the measurement, where the scales' temperature has no uncertainty."""
         return replace(self, u_scale_temperature_k=0.0)
 
     def without_stated_inputs(self) -> StatedInputs:

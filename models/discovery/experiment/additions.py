@@ -15,8 +15,8 @@ from abbe.models.machine import AXES, Machine
 from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_line
 
 BAR_MIN, LASER_MIN, LINE_MIN, TOOL_MIN, WAIT_MIN, LENGTH_MIN = 10.0, 25.0, 20.0, 15.0, 120.0, 10.0
-"""Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; a late repeat's wait; a
-length standard. Shop practice as makers of ball-bars and lasers state it, rounded."""
+"""Minutes to set up: ball-bar; laser on one diagonal; laser or angular interferometer on one axis; another tool; the wait before a late
+repeat; a length standard. Shop practice as makers of ball-bars and lasers state it, rounded."""
 RUN_MIN = 1.0
 POSITION_S = 4.5
 """Time that a laser needs per position: move, dwell, read."""
@@ -98,7 +98,8 @@ def judging_run(case: Case) -> NextTest | None:
     if case.of("holdout") or not bars:
         return None
     minutes = BAR_MIN + RUN_MIN + float(np.ptp(bars[0].at.t_s)) / 60.0
-    return NextTest(("judging_run",), (), None, minutes, "no run of this campaign judges: the path of its first helix, the other way round")
+    why = "this campaign has no holdout run: measure the path of its first helix the other way round"
+    return NextTest(("judging_run",), (), None, minutes, why)
 
 
 def one_feed(bars: list[Path]) -> bool:

@@ -34,12 +34,14 @@ UM = 1e3
 NAME_PRICE = 7.0
 """Price of a name in log likelihood, beside the log of the number of trials: noise alone gains this with a probability of about exp(-7)."""
 OFF, PLACE_Z = 3.5, 4.0
-"""Standard deviations from which a reading is an outlier; from which the deviation of the readings near outliers proves that the position,
-not a lost beam, is the cause (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
+"""`OFF`: a reading this many standard deviations off is an outlier. `PLACE_Z`: if the readings near outliers deviate by this many, the
+position is the cause and not a lost beam (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
 LEAST_INSIDE, LEAST_RUNS, IN_RUNS, ROUGHER = 12, 3, 0.75, 1.2
-"""For a rough place: readings inside and outside that a run must have, runs, share of them that show it, and least ratio of variances."""
+"""What a rough place needs: readings that a run must have inside and outside of it, such runs, the share of them that must show it, and the
+ratio of the variances."""
 CLIPPED, MOSTLY = 4.0, 0.7
-"""Standard deviations as which larger deviations count at a rough place; share of wrong readings there from which they belong to it."""
+"""At a rough place, larger deviations count as `CLIPPED` standard deviations. Wrong readings belong to the place if at least the share
+`MOSTLY` of them lies there."""
 UNNAMED_PRICE = 3.0
 BURST_PRICE = 7.0
 """Further price of a burst: noise has memory, so a few of its readings in a row are large more often than the price of a name says. In 146

@@ -99,7 +99,7 @@ BEGUN = replace(
     needs="the same reversals before and after it begins",
     signature="the steps of a lost motion are missing in the first runs",
     remedy="mechanics",
-    remedy_text="find what came loose: coupling, nut, thrust bearing or clamp; do not enter it as backlash compensation before",
+    remedy_text="find what came loose: coupling, nut, thrust bearing or clamp; enter no backlash compensation before that",
     variant_of="backlash",
     beside=("backlash", "backlash_position_dependent", "servo_mismatch", "reversal_spike"),
 )

@@ -26,7 +26,7 @@ MOST_PLANES = 3
 NO_SLOPE = 1e-12
 """Slopes up to this size are rounding and count as zero."""
 STEEPEST = 1.0 + 1e-9
-"""Largest slopes of the coordinate that a plane faces over the other two; for every plane, some coordinate has slopes up to 1."""
+"""A plane faces a coordinate whose slopes over the other two are at most this; every plane faces at least one."""
 RANK_TOLERANCE = 1e-3
 """Singular values below this share of the largest do not count: the coefficient would be a thousand times less certain than a reading."""
 FLATNESS = 5e-3

@@ -182,7 +182,9 @@ def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
         cause = f"the length of the bar of {radii} mm is not calibrated" if some else "no bar length here is calibrated"
         out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
     if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.fixed):
-        out.append(Addition("tilt", "the tilt of the mirror is unknown and reads like it", "a mirror of measured tilt", knows=tilts))
+        out.append(
+            Addition("tilt", "the tilt of the mirror is unknown and gives the same readings", "a mirror of measured tilt", knows=tilts)
+        )
     return out
 
 
@@ -237,8 +239,8 @@ def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
 def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) -> list[Addition]:
     longer, aside = _other_tools(machine, runs)
     one = len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs}) == 1
-    length = "all runs used one tool length" if one else "the tools of these runs give it no lever of its own"
-    beside = "in all runs the tool's end stood on one line, so that turning about it is not seen" if one else length
+    length = "all runs used one tool length" if one else "no tool of these runs gives it a lever arm of its own"
+    beside = "in all runs the tool's end lay on one line, and a rotation about this line changes no reading" if one else length
     short = " with one tool length" if one else " with these tools"
     lined = " with tools that end on one line" if one else short
     count = "at one place" if there.cups == 1 else f"at {there.cups} places"

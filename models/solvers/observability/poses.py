@@ -20,8 +20,8 @@ from abbe.models.solvers.observations import RunData
 
 DEGREE = 4
 HIDDEN, TOLERANCE = 0.02, 1e-3
-"""A field is hidden if less than the first share of it is left without form and poses; singular values that count, to the largest: poses
-that differ by a millimetre only on paper give no information about micrometres."""
+"""`HIDDEN`: a field is hidden if form and poses can explain all but a smaller share of it. `TOLERANCE`: least singular value that counts,
+as a share of the largest: poses that differ by a millimetre only on paper give no information about micrometres."""
 FLAT = 1e-3
 SHIFT = 0.37
 """Proposed shift as a share of a pitch: no simple fraction, so that it also shifts against the lead of a screw."""

@@ -86,5 +86,5 @@ def test_a_swirl_is_called_unknown_because_one_plate_cannot_exclude_the_machine(
     found = plate_fit(made(0.025 * np.stack([-q[:, 1], q[:, 0]], axis=1) * (q**2).sum(axis=1, keepdims=True)))
     assert found is not None
     assert found.value[3] == pytest.approx(0.025, rel=1e-6)
-    assert found.verdict.startswith("unknown: rotation growing with r²")
+    assert found.verdict.startswith("unknown: one plate cannot show whether the rotation growing with r²")
     assert plate_fit(pose(0)) is None  # a probed plate says nothing alone

@@ -76,5 +76,5 @@ def test_plug_plates_of_a_production_mill_give_the_printed_fits(shared: Path, na
     if offset is not None:
         assert found.offset_mm == pytest.approx(offset, abs=6e-4)
         assert found.rotation_rad * 57.29578 == pytest.approx(rotation, abs=6e-4)
-    word = {"D8131_1": "", "D8300_1": "none", "D1597A_orig_meas_2003": "unknown: rotation growing with r²"}[name]
+    word = {"D8131_1": "", "D8300_1": "none", "D1597A_orig_meas_2003": "unknown: one plate cannot show"}[name]
     assert found.verdict.startswith(word)
