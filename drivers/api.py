@@ -228,7 +228,7 @@ class BallBar(Protocol):
 class DisplacementMeter(Protocol):
     """A laser Doppler displacement meter, or any other; positive: the target moves away from the instrument.
 
-    Every call ends in its own time-out. After a lost connection the driver connects again with the next call; the zero may be lost then.
+    Every call has its own time-out. After a lost connection the driver connects again with the next call; the zero may be lost then.
     """
 
     async def identify(self) -> DeviceInfo:
@@ -320,9 +320,9 @@ class TableState(NamedTuple):
 class OneBank(Protocol):
     """A control with one table, which acts while its compensation is on. The table is an image (`abbe.drivers.tables`).
 
-    ``write_table``: Refused while the table acts. ``switch``: numbered, so that a late or repeated request does nothing; Refused if the
-    CRC-32 of the control's image is not ``expect_crc``, or if compensation is in that state already. Compensation that is off stays off
-    after a restart.
+    ``write_table`` raises Refused while the table acts. ``switch`` is numbered, so that a late or repeated request does nothing; it raises
+    Refused if the CRC-32 of the control's image is not ``expect_crc``, or if compensation is already in the wanted state. Compensation that
+    is off stays off after a restart.
     """
 
     async def status(self) -> ControllerStatus: ...

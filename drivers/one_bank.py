@@ -1,9 +1,9 @@
-"""A control with one table, shown to the push machine as one with two banks (level 1).
+"""A control with one table, presented as a control with two banks (level 1), as a push needs them.
 
 The table that acts is bank "active"; the other bank is memory of this process, where a new table is staged and read back while the old one
 acts. `OneBankTables.activate` switches compensation off, writes the table, reads it back in full and switches compensation on again. The
 control itself refuses writes while its table acts, and refuses to switch on a table without the expected CRC. So a mixture of two tables
-never acts. An interruption leaves compensation off; the push machine then restores the old table from its journal. A crash loses the staged
+never acts. An interruption leaves compensation off; the push then restores the old table from its journal. A crash loses the staged
 table and the lease: they exist only in this process.
 
 Weaker than two banks (docs/how-to/correct.md): no table acts during the exchange; Abbe checks the interlocks before each switch, but the
@@ -31,7 +31,7 @@ _MAGIC, _HEADER_BYTES = b"\xab\xbe", 8
 
 
 def image_in(store: bytes) -> bytes:
-    """Return the image that a table store begins with; empty if none does (`abbe.drivers.tables`)."""
+    """Return the image at the beginning of a table store; empty if there is none (`abbe.drivers.tables`)."""
     length = 2 * int.from_bytes(store[6:8], "big") if store[:2] == _MAGIC and len(store) >= _HEADER_BYTES else 0
     return store[:length] if length <= len(store) else b""
 

@@ -1,4 +1,4 @@
-"""The two compensation banks: lease, writing, sealing, compare-and-swap, and what waits for the control's restart."""
+"""The two compensation banks: lease, writing, sealing, compare-and-swap, and tables that wait for the control's restart."""
 
 from __future__ import annotations
 
@@ -37,10 +37,10 @@ class Networks(Protocol):
     """The control's live correction networks."""
 
     def load(self, bank: int, network: Network) -> bool:
-        """Set a network that does not act; True when every value reads back."""
+        """Set the values of the network that does not act; return True if every value reads back."""
 
     def select(self, bank: int) -> bool:
-        """Let a network act; True when the control says so."""
+        """Make a network act; return True if the control confirms it."""
 
 
 class Banks:
@@ -49,11 +49,11 @@ class Banks:
     Parameters
     ----------
     networks : Networks
-        Where live tables go.
+        Destination of tables that act at once.
     sets : TableSets
-        Where tables go that need a restart.
+        Destination of tables that act after a restart.
     acting : list of int
-        Image whose files the running control has read at its start: bank 0 begins with it.
+        Image whose files the running control read at its start; bank 0 begins with it.
 
     Raises
     ------
@@ -76,7 +76,7 @@ class Banks:
             raise RuntimeError("the control's network does not take values: is volumetric.hal the one of this bridge?")
 
     def write(self, bank: int, offset: int, words: list[int]) -> bool:
-        """Write words into the bank that does not act; False, and nothing done, for the other."""
+        """Write words into the bank that does not act; for the other bank do nothing and return False."""
         if bank == self.active or not 0 <= offset <= image.BANK_WORDS - len(words):
             return False
         self._unstage(bank)
@@ -86,15 +86,15 @@ class Banks:
         return True
 
     def owner(self, now_s: float) -> int:
-        """Who holds the lease; 0 nobody."""
+        """Owner of the lease; 0: nobody."""
         return self._owner if now_s < self._lease_end_s else 0
 
     def lease_left_ms(self, now_s: float) -> int:
-        """What is left of the lease, in ms."""
+        """Remaining time of the lease, ms."""
         return int((self._lease_end_s - now_s) * 1000) if self.owner(now_s) else 0
 
     def lease(self, owner: int, lease_ms: int, now_s: float) -> Result:
-        """Take or prolong the lease."""
+        """Take or extend the lease."""
         if not owner or not lease_ms:
             return Result.BAD_ARGUMENT
         if self.owner(now_s) not in (0, owner):
@@ -103,14 +103,14 @@ class Banks:
         return Result.OK
 
     def release(self, owner: int, now_s: float) -> Result:
-        """Give the lease back."""
+        """Release the lease."""
         if self.owner(now_s) not in (0, owner):
             return Result.LEASED
         self._owner = 0
         return Result.OK
 
     def seal(self, bank: int, owner: int, now_s: float) -> Result:
-        """Check that the bank holds what the control can reproduce, and fix its CRC."""
+        """Check that the control can reproduce the bank's image, and fix its CRC."""
         refusal = self._refusal(bank, owner, now_s)
         if refusal:
             return refusal
@@ -124,9 +124,10 @@ class Banks:
         return Result.OK
 
     def activate(self, bank: int, owner: int, expected: tuple[int, int], *, may_act: bool, now_s: float) -> Result:
-        """Let a sealed bank act if its CRC and the generation are the ``expected`` ones.
+        """Make a sealed bank act if its CRC and the generation are the ``expected`` ones.
 
-        A table whose files differ from those that the control has read at its start is only laid down for the next start: ``RESTART``.
+        If the table's files differ from those that the control read at its start, it is only stored for the next start, and the result is
+        ``RESTART``.
         """
         refusal = self._refusal(bank, owner, now_s)
         if refusal:

@@ -1,8 +1,8 @@
 #!/usr/bin/python3
 """Put the register map of docs/protocols/cnc.md in front of a running LinuxCNC.
 
-Runs with the control's own Python (the one that has the modules ``linuxcnc`` and ``hal``), needs nothing else, and ends with the control.
-``bridge.py --prepare RUNDIR`` before the control's start makes sure that there are tables for it to read.
+It runs with the control's own Python, which has the modules ``linuxcnc`` and ``hal``, needs nothing else, and ends with the control.
+``bridge.py --prepare RUNDIR``, run before the control starts, makes sure that there are tables for it to read.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _listening(host: str, port: int) -> socket.socket:
 
 
 async def run(rundir: Path, listening: socket.socket) -> None:
-    """Wait for the control, serve until it ends."""
+    """Wait for the control, then serve until it ends."""
     from control import ControlGone  # here, because "--prepare" has no control yet
 
     clock = Clock()

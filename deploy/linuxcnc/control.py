@@ -21,7 +21,7 @@ class ControlGone(Exception):  # noqa: N818 - reads as what it is
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The control at one instant. ``ready``: it executes nothing and stands; positions are commanded ones in mm."""
+    """The control at one instant. ``ready``: it executes nothing and no axis moves. Positions are commanded ones, mm."""
 
     estop: bool
     drives_on: bool
@@ -40,7 +40,7 @@ class Snapshot:
     deflected: bool
     tripped: bool
     probed_mm: tuple[float, float, float]
-    """Commanded position at which the probe tripped in the last probing move, if it did (``tripped``)."""
+    """Commanded position at which the probe tripped in the last probing move, if it tripped (``tripped``)."""
 
 
 class Control:
@@ -49,7 +49,7 @@ class Control:
     Raises
     ------
     ControlGone
-        It does not run, or not with three joints in mm.
+        The control does not run, or does not have three joints in mm.
     """
 
     def __init__(self) -> None:
@@ -77,7 +77,7 @@ class Control:
         Raises
         ------
         ControlGone
-            It has ended.
+            The control has ended.
         """
         self._poll()
         s = self._status
@@ -105,7 +105,7 @@ class Control:
         )
 
     def complaints(self) -> list[str]:
-        """What the control has told its operator since the last call."""
+        """Messages of the control to its operator since the last call."""
         told = []
         while (entry := self._errors.poll()) is not None:
             told.append(str(entry[1]).strip())
@@ -120,7 +120,7 @@ class Control:
         self._sent = self._command.serial
 
     def work_offset_mm(self) -> tuple[float, float, float] | None:
-        """Zero of the active work coordinates, to which G38 refers; None if they are turned."""
+        """Zero of the active work coordinates, mm, to which G38 refers; None if these coordinates are rotated."""
         self._poll()
         s = self._status
         return None if s.rotation_xy else tuple(float(s.g5x_offset[n] + s.g92_offset[n]) for n in range(JOINTS))
@@ -135,17 +135,17 @@ class Control:
         self._sent = self._command.serial
 
     def abort(self) -> None:
-        """Stop on the path and forget the rest."""
+        """Stop on the path and discard the rest."""
         self._command.abort()
         self._sent = self._command.serial
 
     def estop(self) -> None:
-        """Go into the e-stop state: motion ends where it is, drives go off."""
+        """Go into the e-stop state: the motion ends where it is, and the drives are switched off."""
         self._command.state(linuxcnc.STATE_ESTOP)
         self._sent = self._command.serial
 
     def switch_on(self) -> None:
-        """Leave the e-stop state and switch the drives on, as far as the control lets us within some tenths of a second."""
+        """Leave the e-stop state and switch the drives on, if the control allows it within some tenths of a second."""
         wishes = [(linuxcnc.STATE_ESTOP_RESET, linuxcnc.STATE_ESTOP), (linuxcnc.STATE_ON, linuxcnc.STATE_ESTOP_RESET)]
         for wish, former in wishes:
             for _ in range(SWITCH_TRIES):  # the control looks at its e-stop input now and then only
@@ -158,7 +158,7 @@ class Control:
         self._sent = self._command.serial
 
     def hold(self, *, on: bool) -> None:
-        """Hold the feed of whatever moves, or let it go."""
+        """Set or release feed hold, whatever moves."""
         hal.set_p("abbe-feed.in1", str(int(on)))
 
     def path_output(self, *, on: bool) -> None:
@@ -172,19 +172,19 @@ class Control:
     # ---- compensation ------------------------------------------------------------------------------------------------------------
 
     def load(self, bank: int, network: Network) -> bool:
-        """Set the network of a bank; True when every value reads back."""
+        """Set the values of a bank's network; return True if every value reads back."""
         wanted = list(parameters(bank, network))
         for name, value in wanted:
             hal.set_p(name, repr(value))
         return all(self._get(name) == value for name, value in wanted)
 
     def select(self, bank: int) -> bool:
-        """Let a network act; True when the switch has taken it."""
+        """Make a network act; return True if the switch confirms it."""
         hal.set_p("abbe-switch.in0", str(bank))
         return int(self._get("abbe-switch.in0")) == bank
 
     def seen(self) -> bool:
-        """Whether a bridge has run in front of this start of the control before; says so to the next one."""
+        """Whether another bridge has already run since the control's start; leaves a mark for the next one."""
         before = bool(self._get("abbe-seen.in0"))
         hal.set_p("abbe-seen.in0", "1")
         return before

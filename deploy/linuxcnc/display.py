@@ -1,7 +1,7 @@
 #!/usr/bin/python3
-"""An operator without a face: releases the e-stop, switches the machine on, references all axes, then waits for TERM.
+"""An operator without a screen: it releases the e-stop, switches the machine on, references all axes, then waits for TERM.
 
-``$ABBE_READY`` names the file that exists while the machine is referenced. With ``$ABBE_OPERATOR=absent`` nothing is touched.
+``$ABBE_READY`` names a file that exists while the machine is referenced. With ``$ABBE_OPERATOR=absent`` it does nothing.
 """
 
 import os
@@ -36,11 +36,11 @@ def _until(status, true, ask=None) -> None:
         if ask and turn % 10 == 0:
             ask()
         signal.sigtimedwait([], 0.01)
-    sys.exit("the control does not do what it was asked to")
+    sys.exit("the control did not execute the command")
 
 
 def main() -> None:
-    """Reference, say so, wait."""
+    """Reference the axes, report it, wait."""
     signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))
     ready = Path(os.environ.get("ABBE_READY", "ready"))
     try:

@@ -1,7 +1,7 @@
-"""One-axis tables as files that the control reads at its start (COMP_FILE), in sets that are exchanged with one rename.
+"""One-axis tables as files that the control reads at its start (COMP_FILE), in sets that one rename exchanges.
 
 In the run folder ``tables`` is a link to the set that the next start reads. A set is a folder with ``image.bin`` and the three files made
-of it; it is complete and on the disk before the link points to it, so the control never finds half of one.
+of it. It is complete and on the disk before the link points to it, so the control never finds an incomplete set.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ class TablesAltered(Exception):  # noqa: N818 - reads as what it is
 
 
 def text_of(vertices: Vertices) -> str:
-    """A COMP_FILE of type 1: bare triples nominal, forward, reverse; the last two are added to the command.
+    """Return a COMP_FILE of type 1: triples of nominal, forward and reverse, mm; the last two are added to the command.
 
-    No header and no comment: the control ends reading at the first line that is no triple, without a word.
+    It has no header and no comment: the control stops reading at the first line that is no triple, without a message.
     """
     rows = vertices or ((0.0, 0.0), (_FAR_MM, 0.0))
     return "".join(f"{nominal:.5f} {value:.6f} {value:.6f}\n" for nominal, value in rows)
@@ -66,17 +66,17 @@ class TableSets:
         Raises
         ------
         TablesAltered
-            Somebody edited the files.
+            A file was changed since the bridge wrote it.
         """
         return self._image(self._link.resolve())
 
     def acting(self, *, fresh_start: bool) -> list[int]:
-        """Image of the set that the running control has read; ``fresh_start``: it has started just now, and read the present set.
+        """Image of the set that the running control has read; ``fresh_start``: it has just started and read the present set.
 
         Raises
         ------
         TablesAltered
-            Somebody edited the files.
+            A file was changed since the bridge wrote it.
         """
         note = self._run / _ACTING
         if fresh_start or not note.exists():

@@ -22,23 +22,23 @@ _HEADER = struct.Struct(">4HI2H3HH3i3i")
 
 
 class ImageError(ValueError):
-    """These words are no image, or none that this control can reproduce."""
+    """The words are no image, or an image that this control cannot reproduce."""
 
 
 @dataclass(frozen=True)
 class Plan:
-    """How the control gets a table.
+    """The form in which the control gets a table.
 
     Attributes
     ----------
     kind : int
         0, 1 or 2.
     network : Network
-        What the live network holds.
+        Content of the network that acts at once.
     files : dict
-        Axis -> vertices of its COMP_FILE (position mm, correction mm); takes effect at the control's start. Missing: none.
+        Axis -> vertices of its COMP_FILE (position mm, correction mm), which takes effect at the control's start; a missing axis has none.
     worst_lsb : float
-        Largest difference between a node of the image and what the curves give there.
+        Largest difference, LSB, between a node of the image and the correction by the curves there.
     """
 
     kind: int
@@ -65,17 +65,17 @@ def empty() -> list[int]:
 
 
 def data_of(words: list[int]) -> bytes:
-    """Words as the big-endian bytes over which the CRC is taken."""
+    """Return words as big-endian bytes, over which the CRC is computed."""
     return struct.pack(f">{len(words)}H", *words)
 
 
 def words_of(data: bytes) -> list[int]:
-    """Big-endian bytes as words."""
+    """Return big-endian bytes as words."""
     return list(struct.unpack(f">{len(data) // 2}H", data))
 
 
 def length_of(words: list[int]) -> int:
-    """How many words the image says it has."""
+    """Number of words that the image states in its header."""
     return words[3]
 
 
@@ -85,12 +85,12 @@ def checksum(words: list[int]) -> int:
 
 
 def plan(words: list[int]) -> Plan:
-    """Read a bank's words and decide where each curve goes.
+    """Read a bank's words and decide whether each curve goes into the network or a file.
 
     Raises
     ------
     ImageError
-        Not an image, or none that 16-point curves and 256-point one-axis files reproduce.
+        The words are no image, or an image that 16-point curves and 256-point one-axis files cannot reproduce.
     """
     table = _parse(words)
     if table.kind == 0:
@@ -159,7 +159,7 @@ def _grid(table: _Table, ends: dict[str, tuple[float, float]]) -> Plan:
         shifts |= {(a, i): parts.vertices(a, parts.shift(a)) for a in AXES}
         levers |= {(a, k, i): parts.vertices(a, values) for (a, k), values in parts.levers.items()}
     if worst > GRID_TOLERANCE_LSB:
-        raise ImageError(f"the grid is no sum of shifts and angles times lever arms: {worst:.1f} units are left at a node")
+        raise ImageError(f"the grid is not a sum of shifts and of angles times lever arms: {worst:.1f} units are left at a node")
     return Plan(2, Network(shifts, levers, ends), worst_lsb=worst)
 
 

@@ -1,4 +1,4 @@
-"""A Modbus TCP server out of the standard library: a control's own computer needs nothing installed for it."""
+"""A Modbus TCP server that needs only the standard library, so nothing has to be installed on the control's computer."""
 
 from __future__ import annotations
 
@@ -14,21 +14,21 @@ _MBAP = struct.Struct(">HHHB")
 
 
 class Registers(Protocol):
-    """What is served: words at addresses."""
+    """The registers to serve: words at addresses."""
 
     def read(self, address: int, count: int) -> list[int] | None:
-        """Words of one read request; None for addresses that do not exist."""
+        """Return the words of one read request; None for addresses that do not exist."""
 
     def write(self, address: int, words: list[int]) -> bool:
-        """Take one write request; False for addresses that cannot be written."""
+        """Execute one write request; return False for addresses that cannot be written."""
 
 
 class Fault(Exception):  # noqa: N818 - Modbus calls it an exception code, and this is one
-    """The request is answered with an exception code."""
+    """The reply to the request is an exception code."""
 
 
 def answer(registers: Registers, pdu: bytes) -> bytes:
-    """Give the reply to one request: function codes 3, 4, 6 and 16."""
+    """Return the reply to one request with function code 3, 4, 6 or 16."""
     function = pdu[0]
     try:
         if function in (3, 4):

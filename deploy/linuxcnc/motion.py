@@ -20,7 +20,7 @@ Point = tuple[float, float, float]
 
 
 class Result(IntEnum):
-    """MOTION_RESULT and FIFO_RESULT."""
+    """Result of a command, as in the registers MOTION_RESULT and FIFO_RESULT."""
 
     OK = 0
     BAD_ARGUMENT = 1
@@ -46,11 +46,11 @@ class _Pending:
     points: int
     aborted: bool = False
     touch_from_mm: Point | None = None
-    """Where a touch began; None: no touch."""
+    """Position at which a touch began; None: the move is no touch."""
 
 
 class Motion:
-    """What the bridge has asked the control to do, and how far it is.
+    """Commands of the bridge to the control, and their progress.
 
     Parameters
     ----------
@@ -71,7 +71,7 @@ class Motion:
         """Motions finished since the start."""
         self.path_start_us = self.path_end_us = self.in_position_us = 0
         self.latch: tuple[Point, int] | None = None
-        """Where and when the probe tripped in the last touch; None: it did not."""
+        """Position and time at which the probe tripped in the last touch; None: it did not trip."""
         self.fifo: list[Point] = []
         self._pending: _Pending | None = None
         self._path_points = 0
@@ -82,33 +82,33 @@ class Motion:
 
     @property
     def moving(self) -> bool:
-        """A motion of ours is under way, or the axes are."""
+        """Whether a motion of this bridge is under way, or any axis moves."""
         return self._pending is not None or not self.state.in_position
 
     @property
     def path_running(self) -> bool:
-        """A path of ours is under way."""
+        """Whether a path of this bridge is under way."""
         return self._pending is not None and self._pending.is_path
 
     @property
     def program_running(self) -> bool:
-        """Somebody else's program is."""
+        """Whether a program that this bridge did not start is under way."""
         return self._pending is None and self.state.interpreting
 
     @property
     def held(self) -> bool:
-        """The feed is held: asked for, or the door is open."""
+        """Whether feed hold acts: it was requested, or the door is open."""
         return self.hold == Hold.HOLD or self.state.door_open
 
     @property
     def fifo_free(self) -> int:
-        """Points that still fit."""
+        """Number of path points that still fit."""
         running = self._pending.points - self.points_done if self.path_running and self._pending else 0
         return FIFO_SIZE - len(self.fifo) - running
 
     @property
     def points_done(self) -> int:
-        """Points reached of the running or last path."""
+        """Number of points that the running path, or else the last one, has reached."""
         if self._pending is None or not self._pending.is_path:
             return self._path_points
         # At rest the control still shows the line of the program before.
@@ -117,7 +117,7 @@ class Motion:
 
     @property
     def latch_period_us(self) -> int:
-        """How often the control looks at the probe."""
+        """Period at which the control reads the probe, µs."""
         return self._control.latch_period_us
 
     def may_move(self) -> bool:
@@ -129,7 +129,7 @@ class Motion:
     # ---- time --------------------------------------------------------------------------------------------------------------------
 
     def tick(self) -> None:
-        """Look at the control, and see what has ended."""
+        """Read the control's state and finish the motions that have ended."""
         self.state = self._control.snapshot()
         if self.state.estop and self.alarm != ALARM_ESTOP:
             self.alarm = ALARM_ESTOP
@@ -171,7 +171,7 @@ class Motion:
         return Result.OK
 
     def touch(self, target_mm: Point, feed_mm_min: float) -> Result:
-        """Go straight to a target until the probe trips (G38.3: without a contact it is reached, and nothing is wrong)."""
+        """Go straight to a target until the probe trips (G38.3: without a contact the target is reached, which is no error)."""
         refusal = self._refusal(feed_mm_min) or self._strokes([target_mm])
         if refusal or not self.state.probe_ready or self.state.deflected:
             return refusal or Result.NO_PROBE
@@ -191,7 +191,7 @@ class Motion:
         return Result.OK
 
     def push(self, points_mm: list[Point]) -> Result:
-        """Store points. A path that runs is a program already: it cannot be extended here."""
+        """Store path points. A running path cannot be extended, because the control already executes it as a program."""
         if self.path_running:
             return Result.BUSY
         refusal = self._strokes(points_mm)
@@ -219,7 +219,7 @@ class Motion:
         return Result.OK
 
     def reset_alarm(self) -> Result:
-        """Switch on again after an e-stop that is over."""
+        """Switch the machine on again after an e-stop was released."""
         if not self._control.snapshot().drives_on:
             self._control.switch_on()
             self.state = self._control.snapshot()
@@ -229,7 +229,7 @@ class Motion:
         return Result.OK
 
     def request_hold(self, request: Hold) -> None:
-        """Take the level of HOLD_REQUEST."""
+        """Run, hold or abort, as the register HOLD_REQUEST demands."""
         self.hold = request
         self._control.hold(on=request == Hold.HOLD)
         if request == Hold.ABORT:

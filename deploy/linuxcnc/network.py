@@ -1,14 +1,15 @@
-"""The compensation network out of the control's stock real-time components: its names, its HAL text, its parameters.
+"""The compensation network, made of the control's standard real-time components: its names, HAL text and parameters.
 
-Each of the two banks has a network of its own; one bit (``abbe-bank``) says which of them acts, so that a new table is written and read
-back while the old one acts, and taken over in one servo period. Per bank and corrected axis ``i``::
+Each of the two banks has a network of its own, and one bit (``abbe-bank``) selects the network that acts. So a new table is written and
+read back while the old one acts, and takes over in one servo period. Per bank and corrected axis ``i``::
 
     correction_i = sum over a of F_ai(q_a) + sum over pairs a != k, k != i of G_aki(q_a) q_k
 
-F are shifts (positioning, straightness, squareness) in mm, G angles times the lever arm q_k (mm per mm): what a machine that consists of
-rigid carriages can need. Every F and G is one ``lincurve``: 16 points at most, linear between, ends held.
+F are shifts (positioning, straightness, squareness) in mm; G are angles, in mm per mm, which the lever arm q_k multiplies. A machine that
+consists of rigid carriages needs no other terms. Every F and G is one ``lincurve`` of at most 16 points: linear between them, constant
+beyond the ends.
 
-Run as a program it prints ``volumetric.hal``.
+Run as a program, this file prints ``volumetric.hal``.
 """
 
 from __future__ import annotations
@@ -30,7 +31,7 @@ Vertices = tuple[tuple[float, float], ...]
 
 @dataclass(frozen=True)
 class Network:
-    """What one bank's network holds.
+    """Content of the network of one bank.
 
     Attributes
     ----------
@@ -48,12 +49,12 @@ class Network:
 
 
 def parameters(bank: int, network: Network) -> Iterator[tuple[str, float]]:
-    """Give every HAL item of a bank's network with the value it has to have.
+    """Return every HAL item of a bank's network with its value.
 
     Raises
     ------
     ValueError
-        A curve has more points than the component, or positions that do not rise.
+        A curve has more points than the component allows, or its positions do not rise.
     """
     for axis in AXES:
         low, high = network.ends_mm.get(axis, (-1e6, 1e6))
@@ -78,7 +79,8 @@ def _curve(name: str, vertices: Vertices) -> Iterator[tuple[str, float]]:
 
 
 def hal_text() -> str:
-    """Write the network as a HAL file: joint commands in, ``drive-x..z`` out; the drives' feedback goes to ``abbe-fb-x..z.in0``."""
+    """Return the network as a HAL file. Its inputs are the joint commands, its outputs ``drive-x..z``; the drives' feedback goes to
+    ``abbe-fb-x..z.in0``."""
     banks = [_Bank(bank) for bank in (0, 1)]
     lines = [
         "# Written by network.py: do not edit, run it again. Two networks of correction curves, one per bank, and the switch between them.",

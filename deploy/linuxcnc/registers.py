@@ -1,4 +1,4 @@
-"""The register map of docs/protocols/cnc.md, words to commands and state to words."""
+"""The register map of docs/protocols/cnc.md: converts words to commands, and the state to words."""
 
 from __future__ import annotations
 
@@ -31,21 +31,21 @@ class Clock:
         self._start_s = time.monotonic()
 
     def seconds(self) -> float:
-        """Seconds."""
+        """Time in seconds."""
         return time.monotonic() - self._start_s
 
     def microseconds(self) -> int:
-        """Whole microseconds."""
+        """Time in whole microseconds."""
         return int(self.seconds() * 1e6)
 
 
 class RegisterMap:
-    """The control behind its registers.
+    """The control, seen through its registers.
 
     Parameters
     ----------
     motion, banks : Motion, Banks
-        What the registers are about.
+        Motion and banks that the registers command and show.
     clock : Clock
         Controller time.
     boot_id : int
@@ -65,7 +65,7 @@ class RegisterMap:
     # ---- reading -----------------------------------------------------------------------------------------------------------------
 
     def read(self, address: int, count: int) -> list[int] | None:
-        """Words of one request; None for addresses that do not exist."""
+        """Return the words of one read request; None for addresses that do not exist."""
         for bank, base in enumerate(_BANKS_AT):
             if base <= address and address + count <= base + BANK_WORDS:
                 return self._banks.words[bank][address - base : address - base + count]
@@ -130,7 +130,7 @@ class RegisterMap:
     # ---- writing -----------------------------------------------------------------------------------------------------------------
 
     def write(self, address: int, words: list[int]) -> bool:
-        """Take one request; False for addresses that cannot be written."""
+        """Execute one write request; return False for addresses that cannot be written."""
         end = address + len(words)
         for bank, base in enumerate(_BANKS_AT):
             if base <= address and end <= base + BANK_WORDS:

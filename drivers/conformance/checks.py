@@ -20,13 +20,13 @@ from abbe.drivers.errors import DriverError
 Ask = Callable[[str], Awaitable[object]]
 PASSED, FAILED, NOT_PROVED = CheckVerdict.PASSED, CheckVerdict.FAILED, CheckVerdict.NOT_PROVED
 SAMPLES = 10
-"""Least number of readings at rest, and how long they are taken at least, s."""
+"""Least number of readings at rest, and least time over which they are taken, s."""
 AVERAGED, SETTLED_S = 3, 0.3
 WATCHED_S = 1.0
 BUFFERED_S = 5.0
-"""A reading may have arrived so long before it was asked for, s."""
+"""A reading may have arrived at most this long before it was requested, s."""
 CLOCK_FACTOR = 2.0
-"""The device's clock may differ from this computer's by this factor in a test of a second; a wrong unit differs by 1000."""
+"""In a test of one second the device's clock may run faster or slower than this computer's by this factor; a wrong unit gives 1000."""
 FACTORS = (
     (25.4, "it sends mm, the file says inches"),
     (1.0 / 25.4, "it sends inches, the file says mm"),
@@ -99,7 +99,7 @@ def _wrong_by_driver(sample: Sample, taken: list[Sample], asked_s: float) -> Dev
 
 def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if file is None:
-        return DeviceCheck("freshness", PASSED, "no sample came twice; that its numbers are the device's is up to its driver")
+        return DeviceCheck("freshness", PASSED, "no sample came twice; whether its numbers come from the device depends on its driver")
     stamp = next((name for name in ("counter", "time") if name in file.values), None)
     if stamp is not None:
         return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")
@@ -111,7 +111,7 @@ def _fresh(file: DeviceFile | None) -> DeviceCheck:
         return DeviceCheck(
             "freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s"
         )
-    return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: old values look like new ones")
+    return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
 
 
 def _clock(taken: list[Sample], file: DeviceFile | None) -> list[DeviceCheck]:
@@ -196,7 +196,7 @@ def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
     if abs(got_mm) <= move.tolerance_mm:
         return f"stuck: {read}: it does not follow the target"
     ratio = got_mm / move.mm
-    sign = f"sign: it grows the wrong way, turn sign in the {where}" if ratio < 0 else ""
+    sign = f"sign: it grows the wrong way, change sign in the {where}" if ratio < 0 else ""
     if abs(abs(got_mm) - abs(move.mm)) <= move.tolerance_mm:
         return f"{sign} ({read})"
     share = move.tolerance_mm / abs(move.mm)

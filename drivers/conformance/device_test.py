@@ -52,7 +52,7 @@ RECOVERS_S = 15.0
 """Longest time until a reading is right again."""
 PAUSE_S = 0.2
 AT_REST, NOISES = 10, 10.0
-"""Readings before the first fault, and how many of their standard deviations a right reading may be off."""
+"""Readings before the first fault, and by how many of their standard deviations a right reading may differ from their mean."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy
     open_at : callable
         Opens the device behind the proxy.
     close_mm : float
-        How far from the mean a right reading at rest may be at least, mm or degree C; noise widens it.
+        Least allowed distance of a right reading at rest from the mean, mm or degree C; noise widens it.
     """
     try:
         probe = await open_at()
@@ -205,7 +205,9 @@ async def device_test(text: str, options: Options, utc: str) -> TestReport:
         if probe is not None:
             await _closed(probe)
     if about is not None and not isinstance(about.url, ModbusRtuUrl):
-        found.append(DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry none: a corrupted digit cannot be detected"))
+        found.append(
+            DeviceCheck("check sum", CheckVerdict.NOT_PROVED, "its replies carry no check sum: a corrupted digit cannot be detected")
+        )
     if options.faults:
         found += await _faults(text, about, options.role)
     return _report(text, about, options.role, info, found, utc)
@@ -223,7 +225,7 @@ def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
     """Return the abilities of a device by the findings of its test.
 
     A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was, and if no check failed.
-    No test of a file proves motion or tables: that is up to a driver and `abbe comp commission`.
+    The test of a device file never proves motion or tables: only a driver and `abbe comp commission` do.
     """
     if any(one.verdict is CheckVerdict.FAILED for one in found):
         return ()

@@ -47,7 +47,7 @@ CALL_S = 10.0
 
 
 class DriverDefect(Exception):  # noqa: N818 - what it says is not an error of the device
-    """A driver does what no driver may: it never ends a call, or raises something else than an error of `abbe.drivers.errors`."""
+    """A driver broke a rule: a call never ended, or raised another error than those of `abbe.drivers.errors`."""
 
 
 async def watched(operation: str, call: Awaitable[T]) -> T:
@@ -56,7 +56,7 @@ async def watched(operation: str, call: Awaitable[T]) -> T:
     Raises
     ------
     DriverDefect
-        It had not ended after `CALL_S`, or raised an error that is not of `abbe.drivers.errors`.
+        The call had not ended after `CALL_S`, or raised an error that is not one of `abbe.drivers.errors`.
     """
     try:
         async with asyncio.timeout(CALL_S):

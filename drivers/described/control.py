@@ -25,13 +25,13 @@ CONDITIONS = {
     "nc program": Condition.NC_PROGRAM,
 }
 STUCK_S = 0.5
-"""A counter that stays the same for longer, beyond the ``update_s`` of the device file, is stuck."""
+"""A counter is stuck if it stays the same for longer than ``update_s`` of the device file plus this time, s."""
 UNKNOWN: Point = (float("nan"), float("nan"), float("nan"))
 """Position of a control that shows none."""
 
 
 class ListenedControl:
-    """A control behind a device file, or none (``source`` is None): then its position is unknown. Its clock is this computer's."""
+    """A control behind a device file. Without one (``source`` is None) its position is unknown. Its clock is that of this computer."""
 
     only_listens = True
 

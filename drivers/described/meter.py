@@ -32,8 +32,8 @@ ZEROED_MM = 0.05
 class DescribedMeter:
     """A displacement sensor. `zero` sends the device's own command; without one, it subtracts the present reading from then on.
 
-    A reading is new if the device's counter or time stamp has changed. A device with neither: a reading of registers is new ``update_s``
-    (device file) after the last new one; a line of text is always new.
+    A reading is new if the device's counter or time stamp has changed. For a device with neither, a reading of registers is new if it comes
+    ``update_s`` (device file) after the last new one, and a line of text is always new.
     """
 
     def __init__(self, file: DeviceFile, source: DeviceSource) -> None:

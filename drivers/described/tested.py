@@ -87,7 +87,8 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     Raises
     ------
     NotProved
-        No report, of another device or file, or without this ability; the message names the checks that failed or are missing.
+        There is no report, it is about another device or file, or it does not prove this ability; the message names the checks that failed
+        or are missing.
     """
     remedy = untested_remedy(device)
     if not path:

@@ -108,8 +108,9 @@ _CONNECT = 3
 class Canary:
     """Registers with known content, which verify that replies come from this device and match their requests.
 
-    ``words``: content from ``address`` on; ``readable``: most registers that one request may read from there. The number read varies,
-    because replies of different length cannot be confused. ``functions``: function codes that read any register with the same result.
+    ``words``: content from ``address`` on; ``readable``: largest number of registers that one request may read from there. The number read
+    varies, because replies of different length cannot be confused. ``functions``: function codes that read any register with the same
+    result.
     """
 
     address: int = 0

@@ -17,8 +17,8 @@ STREAM_STYLUS, STREAM_TRIPS = 22, 23
 
 @dataclass(slots=True)
 class Stylus:
-    """The probe in the spindle. ``false_trips``, ``missed``: how many of the next touches go wrong (tests); ``broken``: it was driven
-    into the material."""
+    """The probe in the spindle. ``false_trips``, ``missed``: number of the next touches that trip falsely or not at all (tests);
+    ``broken``: it was driven into the material."""
 
     radius_mm: float
     pretravel_mm: float

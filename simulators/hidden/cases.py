@@ -222,7 +222,7 @@ def _per_setup(fitted: FittedRuns, kind: str) -> F:
 
 
 def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> list[str]:
-    """Return the labels of rivals that explain an effect's remainder ``left`` (n,) so well that its chi-square falls below `INDISTINCT`."""
+    """Return the labels of rivals that explain what is ``left`` (n,) of an effect down to a chi-square below `INDISTINCT`."""
     labels, blocks = zip(*traces(fitted), strict=True)
     raw = np.hstack(blocks) * projector.weight[:, None]
     kept = projector.columns.T @ raw
@@ -246,7 +246,8 @@ ALL_EFFECTS = (drive, instrument, outside, structure, thermal)
 """Imported so that their effects are registered."""
 SNR_LOCAL = (0.6, 8.0)
 TOUCHED = 0.1
-"""A reading is touched if what the model cannot absorb of the effect, over the noise, exceeds this fraction of its maximum."""
+"""A reading is touched if the part of the effect that the model cannot absorb, divided by the noise, exceeds this fraction of its
+maximum."""
 ADDED = {
     "one_way": ["opposite_direction"], "one_feed": ["second_feed"], "one_radius": ["second_radius"], "ballbar": ["laser_diagonals"],
     "laser": ["ballbar"], "minimal": ["opposite_direction", "second_feed", "second_radius", "planar_circles", "laser_diagonals"],

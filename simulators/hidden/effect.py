@@ -43,9 +43,9 @@ class Bend:
 class Hidden:
     """One effect of one machine.
 
-    ``name`` and ``key`` as in the effect catalogue; ``parameters``: ``strength`` in the effect's unit, and further ones that it needs;
-    ``wild``: seed of its departures from the textbook form, 0: none; ``bent``: factor of their size, usually 1; ``stream``: seed of its
-    other random values (phases, directions of a set-up).
+    ``name`` and ``key`` as in the effect catalogue; ``parameters``: ``strength`` in the effect's unit, and any others that the effect
+    needs; ``wild``: seed of its departures from the textbook form, 0: none; ``bent``: factor of their size, usually 1; ``stream``: seed of
+    its other random values (phases, directions of a set-up).
     """
 
     name: str
