@@ -1,4 +1,4 @@
-"""The service's clocks: monotonic for waiting and for durations, UTC for people and for slots; and the format of stored times."""
+"""The service's clocks: a monotonic one for waits and durations, and UTC for people and the timetable. Also the format of stored times."""
 
 from __future__ import annotations
 

@@ -83,7 +83,7 @@ def load_machine(path: Path | str) -> LoadedMachine:
 
 
 def _with_files(machine: MachineFile, folder: Path) -> MachineFile:
-    """Return the machine file with the files of its device URLs named from any working directory."""
+    """Return the machine file with absolute paths in its device URLs, so that they hold in any working directory."""
     urls = {role: beside(url, folder) for role, url in machine.devices.model_dump().items() if url is not None}
     return machine.model_copy(update={"devices": machine.devices.model_copy(update=urls)})
 
@@ -135,7 +135,7 @@ def _text(body: bytes) -> str:
 
 
 _TOKEN = re.compile(r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{]|[\]}]|\n""", re.DOTALL)
-"""What can hide, open or close brackets and lines of TOML: texts, comments, brackets, ends of lines."""
+"""Parts of a TOML text that decide where a statement ends: strings, comments, brackets, ends of lines."""
 
 
 def key_lines(text: str) -> dict[str, int]:
@@ -180,7 +180,7 @@ def _header(values: Mapping[str, Any], tables: dict[str, int]) -> str:
 
 
 def _overrides() -> dict[str, Any]:
-    """Values of ``ABBE_KEY`` and ``ABBE_TABLE__KEY``; variables such as ABBE_DB, which name no key, are none of the machine file's."""
+    """Values of ``ABBE_KEY`` and ``ABBE_TABLE__KEY``. Variables that name no key, such as ABBE_DB, are left out."""
     found: dict[str, Any] = {}
     for name, text in sorted(os.environ.items()):  # ABBE_WEB before ABBE_WEB__PORT
         if not name.upper().startswith(PREFIX):

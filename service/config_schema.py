@@ -43,7 +43,7 @@ def _certificate(day: date | None) -> date | None:
 
 
 Coefficient = Annotated[float, Field(ge=-1e-5, le=1e-4)]
-"""Expansion coefficient, 1/K: some glass ceramics and fibres shrink; a number in µm/m/K is above the largest."""
+"""Bounds of an expansion coefficient, 1/K: negative for some glass ceramics and fibres; a number in µm/m/K is above the largest."""
 CoefficientUncertainty = Annotated[float, Field(gt=0.0, le=1e-5)]
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
 MachineWindow = Annotated[Window, AfterValidator(complete)]
@@ -159,7 +159,7 @@ class Limits(ConfigTable):
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
         default_factory=list,
         description="conditions that only suspend a measurement, which resumes by itself when they have cleared; e-stop and alarm always "
-        "end it. ballbar: the connection to its box was lost, or the box restarted, and it answers again",
+        "end it. ballbar: its box lost the connection or restarted, until it answers again",
     )
     suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension; after it the run ends")
     settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
@@ -218,8 +218,8 @@ class Material(ConfigTable):
     )
     workpiece_per_k: Coefficient | None = Field(
         default=None,
-        description="expansion coefficient of the workpieces, 1/K: reports then also show what a part, made as warm as the scales, has at "
-        "20 °C",
+        description="expansion coefficient of the workpieces, 1/K: reports then also show the deviations that a part, made as warm as the "
+        "scales, has at 20 °C",
     )
     u_workpiece_per_k: CoefficientUncertainty | None = Field(default=None, description="its standard uncertainty, 1/K")
 
@@ -256,7 +256,7 @@ class Calibration(ConfigTable):
     ballbar_is: str = Field(
         default="", max_length=400, description="maker, model and serial of the ball-bar; number and laboratory of its certificate"
     )
-    laser_is: str = Field(default="", max_length=400, description="the same of the laser")
+    laser_is: str = Field(default="", max_length=400, description="the same for the laser")
 
 
 class Nc(ConfigTable):
@@ -393,7 +393,7 @@ def _public_key(text: str) -> str:
 
 
 class Signatures(ConfigTable):
-    """Keys whose signature makes a compensation file more than a candidate."""
+    """Keys of the people whose signatures are trusted; a compensation file without a trusted signature is only a candidate."""
 
     trusted: list[Annotated[str, AfterValidator(_public_key)]] = Field(
         default_factory=list, description="public keys of metrologists, 64 hex digits each, as `abbe key new` prints them"
@@ -404,12 +404,15 @@ class AlarmSection(ConfigTable):
     """When scheduled checks raise an alarm before a limit is exceeded, and the reactions that the service may start by itself."""
 
     warn_days: float = Field(
-        default=14.0, ge=0.0, le=3650.0, description="alarm when a limit may be reached within this many days (lower end, 95 %); 0: never"
+        default=14.0,
+        ge=0.0,
+        le=3650.0,
+        description="alarm when a figure may reach its limit within this many days (lower end of the 95 % interval); 0: never",
     )
     campaign: str = Field(
         default="identification",
         min_length=1,
-        description="what a schedule with on_alarm measures: identification, or a recipe FILE.toml beside this file",
+        description="what the service measures for a schedule with on_alarm: identification, or a recipe FILE.toml beside this file",
     )
     push: Literal["never", "approved"] = Field(
         default="never",

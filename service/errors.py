@@ -349,7 +349,8 @@ class FormatRefused(AbbeError):
 
 
 class TableFileError(AbbeError):
-    """A table file that a control could not read completely, or that is not its own; a message about a mistake names file and line."""
+    """A control could not read this table file completely, or the file is for another control; the message names file and line of a
+    mistake."""
 
     code = "TAB-002"
 
@@ -379,7 +380,7 @@ class CaptureConflict(AbbeError):
 
 
 class AlarmRefused(AbbeError):
-    """An alarm cannot be acknowledged or shelved like this. Nothing was recorded."""
+    """This acknowledgement or shelving of an alarm is not allowed. Nothing was recorded."""
 
     code = "ALM-010"
 
@@ -478,7 +479,7 @@ class Mistake:
 
 
 def mistakes(errors: Iterable[ErrorDetails]) -> list[Mistake]:
-    """Parse the errors of a pydantic ``ValidationError``; one that is due to an unknown key first.
+    """Parse the errors of a pydantic ``ValidationError``; errors about unknown keys come first.
 
     A mistyped key is both unknown and missing: naming the unknown one helps more.
     """

@@ -1,4 +1,4 @@
-"""Read files from outside Abbe: plain files only, up to a size limit. And lock files of its own."""
+"""Read files from outside Abbe (plain files only, up to a size limit), and lock Abbe's own files."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Logging of the service's processes: to stderr, one JSON object a line for machines, readable lines in a terminal."""
+"""Logging of the service's processes to stderr: readable lines in a terminal, otherwise JSON with one object per line."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import structlog
 
 
 def configure_logs(*, as_json: bool = False) -> None:
-    """Log to stderr: one JSON object a line for machines, readable lines in a terminal (not with ``as_json``)."""
+    """Log to stderr: readable lines in a terminal; otherwise, and always with ``as_json``, JSON with one object per line."""
     terminal = sys.stderr.isatty() and not as_json
     shared: list[structlog.typing.Processor] = [
         structlog.contextvars.merge_contextvars,

@@ -42,12 +42,12 @@ url = "sqlite:///abbe.sqlite3"
 # recipe = "quick-check"
 """
 PIVOTS = """
-# About these points the carriages' angular errors turn them.
+# Points about which the angular errors of the carriages turn them.
 [pivots_mm]
 {rows}
 """
 VERIFY = """
-# Above one of these the machine does not pass.
+# The machine fails the check if a figure is above its limit.
 [verify]
 body_diagonal_um = 20.0
 helix_rms_um = 5.0

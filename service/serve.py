@@ -61,7 +61,7 @@ log = structlog.get_logger("abbe.serve")
 JOURNAL_S = 0.25
 """Longest time to read the push journal before a forced end, s."""
 OpenPushReader = Callable[[], str]
-"""Returns a sentence about the push that is still open; empty: none is."""
+"""Returns a sentence about the push that is still open, or an empty text if there is none."""
 STOP_S = 4.5
 """Time from the stop signal until the process is ended by force, s: it must end within 5 s. The store survives that."""
 LEAVE_S = 0.3
@@ -334,7 +334,7 @@ def _admins(url: str) -> int:
 
 
 def cut_off_now(readers: list[OpenPushReader]) -> None:
-    """End the process. The axes have stopped already, and the push journal is written before each step that it permits: nothing is lost."""
+    """End the process. Nothing is lost: the axes have stopped already, and every step of a push is in the journal before it is done."""
     texts: list[str] = []
     for one in readers:  # in a thread of its own: a database that hangs must not delay the end
         reading = threading.Thread(target=lambda read=one: texts.append(read()), daemon=True)

@@ -20,7 +20,7 @@ from abbe.service.sequences.nc.write import NcSettings
 
 @dataclass(frozen=True, slots=True)
 class Site:
-    """Facts about a machine for a workflow. ``doc``: the machine object (docs/schemas/machine.schema.json).
+    """Facts about a machine that a job needs. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
     ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
@@ -80,7 +80,7 @@ def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[s
 
 
 def site_of(config: MachineFile) -> Site:
-    """Convert a machine file to the units and types of the workflows."""
+    """Return the site that a machine file describes."""
     doc = config.machine_doc()
     devices, limits = config.devices, config.limits
     return Site(

@@ -32,8 +32,8 @@ class DiscoveryAnswer:
     effects : dict
         Signed strength with standard uncertainty by label, e.g. ``"backlash:X"``.
     gap : dict
-        For each role of runs (``"identify"``, ``"holdout"``): rms of measured minus simulated readings, with a simulation without the
-        effects (``before_um``) and with them (``after_um``), and the noise that no model removes (``floor_um``).
+        For each role of runs (``"identify"``, ``"holdout"``): rms of the differences between measured and simulated readings, simulated
+        without the effects (``before_um``) and with them (``after_um``); and the noise that no model removes (``floor_um``).
     next_measurement : dict or None
         The most informative next measurement: what it ``adds``, which effects it ``separates``, how many ``minutes`` it takes, and ``why``.
     """

@@ -1,4 +1,4 @@
-"""Plan a campaign: the measurements that tell most in the available minutes."""
+"""Plan a campaign: the measurements that reduce the uncertainty most in the available minutes."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class Plan:
     steps : tuple of (str, float, float)
         Each measurement in words, minutes until it is done, and expected worst U (k = 2) of the deviation afterwards, mm.
     not_observable : tuple of str
-        What this campaign cannot tell, and what would.
+        What this campaign cannot determine, and the measurement that could.
     """
 
     campaign: CampaignPlan

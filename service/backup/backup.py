@@ -30,7 +30,7 @@ from abbe.service.storage.engine import parse_url
 from abbe.service.storage.store import Store
 
 FORMAT, SHARED_FORMAT = "abbe-backup/1", "abbe-backup/2"
-"""With the database as one file, and in pieces."""
+"""Formats of a backup: with the database as one file, and in pieces."""
 LIST = "backup.json"
 DATABASE = "abbe.sqlite3"
 CAPTURE = "capture"
@@ -41,7 +41,7 @@ COUNTED = ("machines", "campaigns", "runs", "chunks", "solutions", "verification
 _PIECE = 1 << 20
 LONGEST_LIST = 64 << 20
 ROOM_BYTES = 256 << 20
-"""Room that a copy beside the database leaves on its disk."""
+"""Disk space that has to stay free beside a copy of the database, bytes."""
 
 
 @dataclass(frozen=True, slots=True)

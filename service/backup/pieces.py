@@ -32,7 +32,8 @@ class ListedPieces:
 def cut(database: Path, folder: Path, earlier: Path | None) -> ListedPieces:
     """Write a database as pieces into the new ``folder`` (0700, files 0600).
 
-    Pieces that ``earlier`` holds undamaged are linked if they are this account's and for it only: a link keeps owner and rights.
+    Undamaged pieces of ``earlier`` are linked if this account owns them and no other account has access, since a link keeps owner and
+    rights.
 
     Raises
     ------
@@ -72,7 +73,7 @@ def join(folder: Path, names: Sequence[str], target: Path) -> None:
 
 
 def check(folder: Path, listed: ListedPieces) -> None:
-    """Refuse a folder with a missing, damaged or additional piece, and pieces of another size in all. Raises BackupRefused, OSError."""
+    """Refuse a folder with a missing, damaged or additional piece, or with pieces of a wrong total size. Raises BackupRefused, OSError."""
     present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if more := sorted(present - set(listed.names)):
         raise BackupRefused(f"{folder / more[0]} is not of this backup", "use another backup")

@@ -1,4 +1,4 @@
-"""`abbe restore`: turn a backup into a database again. Everything is proved first, and a database in use is never replaced."""
+"""`abbe restore`: turn a backup into a database again. Everything is checked first, and a database in use is never replaced."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ def restore(
 ) -> Restored:
     """Restore the backup in ``folder``.
 
-    Everything is proved on a copy beside the target before the target is touched; existing files are renamed, not deleted; the database is
+    Everything is checked on a copy beside the target before the target is touched; existing files are renamed, not deleted; the database is
     moved last. An interruption leaves the old database, the new one, or none, but never a partial one.
 
     Parameters
@@ -114,7 +114,7 @@ def _check_targets(into: BackupSource, database: Path, *, replace: bool) -> _Tar
 
 
 def _prove(part: Path, backup: Path) -> int:
-    """Prove that a copied backup is whole, of a known schema, and unchanged; return its number of audit records."""
+    """Check that a copied backup is complete, of a known schema, and unchanged; return its number of audit records."""
     revision = prove_copy(part / DATABASE)
     if revision not in known_revisions():
         raise BackupRefused(

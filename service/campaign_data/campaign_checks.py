@@ -75,7 +75,7 @@ def _against_feed(run: Run) -> list[CampaignIssue]:
     if FASTEST <= ratio <= slowest:
         return []
     unit = next((text for factor, text in TIME_UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is wrong")
-    what = f"it took {ratio:.2g} times as long as its path at its feed_mm_min: {unit}"
+    what = f"it took {ratio:.2g} times as long as its path takes at its feed_mm_min: {unit}"
     return [
         CampaignIssue(run.run_id, what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)
     ]
@@ -110,9 +110,11 @@ def _named(others: list[str]) -> str:
 
 
 OTHER_FEED = 0.3
-"""Relative difference between a ball-bar run's stated feed and the median one of its positions and times from which the column is wrong."""
+"""Relative difference between the stated feed of a ball-bar run and the median feed of its positions and times; beyond it the column is
+wrong."""
 AGREE, ALIKE = 0.65, 4
-"""Share of like runs (and how many these must be) in which direction and sense of rotation agree, so that the others' column is wrong."""
+"""If direction and sense of rotation agree in this share of the runs of one kind, and in this many runs, the column of the others is
+wrong."""
 
 
 def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
@@ -129,7 +131,7 @@ def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
     for sense in senses.values():
         usual = float(np.sign(sum(sense.values())))
         if len(sense) >= ALIKE and sum(s * usual > 0.0 for s in sense.values()) >= AGREE * len(sense):
-            what = "its column direction contradicts the sense in which its positions turn, which agree in the other runs of this kind"
+            what = "its column direction contradicts the sense of rotation of its positions; the two agree in the other runs of this kind"
             remedy = "correct the column; the search uses the positions"
             out += [CampaignIssue(name, what, remedy, False) for name, s in sense.items() if s * usual < 0.0]
     return out
@@ -194,7 +196,7 @@ def _timed(run: Run, rows: Counter[Any]) -> Counter[Any]:
 def _shows_noise(run: Run) -> bool:
     """Whether the readings show noise, so that a repeated measurement would differ.
 
-    Then places visited again read differently; without such places, the second differences exceed those from rounding.
+    Sign of noise: readings differ at places visited again or, without such places, their second differences exceed those from rounding.
     """
     y, columns = run.columns.readings_mm, run.columns
     states = map(tuple, np.column_stack([columns.q_mm, columns.direction]).tolist())
@@ -381,7 +383,7 @@ def _suspect(s: SuspectRun, *, single: bool) -> CampaignIssue:
     gross = s.misfit_mm > OTHER_RATIO * s.expected_mm and s.misfit_mm > OTHER_MM
     if s.tied:
         who = " or ".join(("it", *(f"run {name}" for name in s.tied)))
-        what = f"contradicts the others ({_misfit(s)}); whether {who} is wrong, these runs cannot tell"
+        what = f"contradicts the others ({_misfit(s)}); these runs cannot show whether {who} is wrong"
         return CampaignIssue(s.run, what, "measure them again", gross or s.cause != "other")
     if s.cause != "other":
         return CampaignIssue(s.run, f"{_READINGS[s.cause]} ({_misfit(s)})", "correct the file, or leave it out (--without)", True)

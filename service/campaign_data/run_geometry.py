@@ -67,7 +67,7 @@ def _bar(test: str, setup: BarSetup, points: F2) -> GeometryMistake | None:
             return _explained(points, place, lambda p: float(np.abs(p[:, normal] - centre[normal]).max())) or _unexplained(place, "plane")
     if radius < SMALLEST_RADIUS_MM:
         return GeometryMistake(
-            f"radius_mm is {radius:g}: no ball-bar is that short, {radius * 25.4:.0f} mm would be", "write mm, not inches"
+            f"radius_mm is {radius:g}: no ball-bar is that short; read as inches it is {radius * 25.4:.0f} mm", "write mm, not inches"
         )
     return None
 
@@ -109,7 +109,7 @@ def _laser(test: str, setup: LaserSetup, points: F2) -> GeometryMistake | None:
 def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None:
     """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     if test == "laser_linear" and setup.axis and not span.any():
-        stood = "the axis stood still: readings over time show no geometry, only a report shows them"
+        stood = "the axis stood still: its readings over time hold no geometry; only a report shows them"
         remedy = "leave the run out (--without); such runs alone, with temperatures, show the thermal response (abbe discover)"
         return GeometryMistake(stood, remedy)
     unit = span / max(float(np.linalg.norm(span)), 1e-9)
@@ -124,7 +124,7 @@ def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None
     letters = setup.diagonal if test == "laser_diagonal" else ""
     if letters and any((s > 0) != (c == "p") for s, c in zip(span, letters, strict=True) if s):  # a face diagonal leaves one axis alone
         return GeometryMistake(
-            f"diagonal is {letters}, but the line from start_mm to end_mm is another", "correct diagonal, start_mm or end_mm"
+            f"diagonal is {letters}, but the line from start_mm to end_mm is another diagonal", "correct diagonal, start_mm or end_mm"
         )
     step, count = setup.increment_mm, setup.steps
     allowed = TOLERANCE_MM + 2.0 * setup.overrun_mm  # the ends are the turning points

@@ -28,7 +28,7 @@ from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.storage.store import Store
 
 GROUP_S = 0.01
-"""A sample waits for others to share one sync until this long after its arrival, even if a slow sync has used up part of that time."""
+"""Longest time, s, after its arrival that a sample waits for others to share one sync; a slow sync before it counts too."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 

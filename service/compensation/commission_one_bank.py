@@ -64,7 +64,7 @@ async def commission_one_bank(controller: Controller, store: Store, site: Site) 
 
 
 async def _try(t: Trial, control: OneBank) -> None:
-    """The forbidden first; then off, a write, and on again."""
+    """Try the forbidden operations first; then switch the table off, write, and switch it on again."""
     crc, part = t.base.crc, t.base.image[:8]
     t.expect_refusal(FLAG, await t.refusal_of(control.write_table(part, first=0)), "a write while the table acts")
     t.expect_refusal(FLAG, await t.refusal_of(control.switch(on=False, expect_crc=crc ^ 1)), "to switch off with another CRC")

@@ -186,7 +186,7 @@ def confirm(source: Path, back: Path, settings: FormatSettings, *, turned: bool 
 
 
 def seen(source: Path, who: str) -> Drop:
-    """Record that a person says to have loaded the tables.
+    """Record a person's statement that the tables were loaded.
 
     Raises
     ------

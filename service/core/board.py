@@ -128,7 +128,7 @@ class StatePublisher:
 
 
 class VerifiedWatch:
-    """Watches which measurement verified the table in force, and reports a change to broker and page: any process may roll back."""
+    """Watches which measurement verified the table in force, and reports changes to broker and page, since any process may roll back."""
 
     def __init__(self, look: Callable[[], VerifiedBy], publisher: Publisher | None, clock: Clock, changed: Callable[[], None]) -> None:
         self._look, self._publisher, self._clock, self._changed = look, publisher, clock, changed

@@ -38,7 +38,7 @@ FORMAT = "abbe-artefact-demo/1"
 CAMPAIGN, BEFORE = "plate", "verify-before"
 HEIGHT_MM = 200.0
 POSES = (((60.0, 60.0), 0.0), ((540.0, 70.0), 90.0), ((148.2, 180.0), 0.0), ((330.0, 200.0), 90.0))
-"""Axis position of the plate's zero in X and Y, and its turn; the shifts are no multiples of a screw's lead."""
+"""Poses of the plate: axis positions X and Y of its zero, mm, and its rotation, degrees. No shift is a multiple of a screw's lead."""
 CHECK = ((500.0, 420.0), 180.0)
 
 

@@ -199,7 +199,7 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
     right = finding.verdict == "named" and named == [label]
     also = [n for n in named if n != label]
     if label in named and also:
-        return False, f"hidden was {label}, which was named, but so was {', '.join(also)}, which is not there"
+        return False, f"hidden was {label}; it was named, but so was {', '.join(also)}, which is not in the machine"
     return right, f"hidden was {label}; the answer was {', '.join(named) or finding.verdict}"
 
 

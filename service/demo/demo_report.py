@@ -45,7 +45,7 @@ TRUTH_TITLES = {
 
 @dataclass(frozen=True, slots=True)
 class TableFactor:
-    """Factor by which the tables reduced the volumetric rms, the largest that nine one-axis tables can, and the reached share of it."""
+    """Factor by which the tables reduced the volumetric rms, largest factor possible with nine one-axis tables, and their ratio."""
 
     reached: float
     bound: float

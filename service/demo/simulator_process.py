@@ -53,7 +53,7 @@ class SimulatorProcess:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class _ReadyLine:
-    """The keys of that line."""
+    """The keys of the line that the simulators print once they answer."""
 
     machine: Doc
     cnc: str

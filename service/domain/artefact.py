@@ -11,7 +11,7 @@ from abbe.service.domain.machine import FileObject, Name, Point, RunFileHead
 ARTEFACT_TEST = "artefact_points"
 MACHINE_PROBE = "machine-probe"
 SQUARE = 1e-6
-"""A stated matrix is a rotation to this accuracy (components)."""
+"""Largest deviation of a stated matrix from a rotation, per component."""
 
 
 def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, Point]:

@@ -194,8 +194,8 @@ class StandstillShift(FileObject):
 class StandstillFile(FileObject):
     """What the temperatures explain of the displacement of a machine at standstill (ISO 230-3).
 
-    ``runs``: fitted runs in order of time. ``covered``: share of readings within U (k = 2) in runs left out. ``model``: the one that
-    predicts better; temperatures as they are, or their changes since the start of a run. ``predictions``: of runs that were not fitted.
+    ``runs``: fitted runs in order of time. ``covered``: share of readings within U (k = 2) in runs left out. ``model``: the better
+    predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: of runs that were not fitted.
     """
 
     format: Literal["abbe-standstill/1"]

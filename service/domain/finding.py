@@ -217,10 +217,10 @@ class MotionChange:
 class ChangedSince:
     """Changes of the machine since an earlier solution.
 
-    ``gap``, ``judged``: None if too few set-ups judge. ``judged``: natural logarithm of how much likelier the changes make runs that were
-    not used to find them. ``hidden_um_m``: possible undetected change of each scale and squareness. ``beside``: effects found in the same
-    runs that may have the same cause. ``proved``: whether runs that were not used to find the changes confirm them. ``trouble``: why
-    nothing could be compared.
+    ``gap``, ``judged``: None if too few set-ups judge. ``judged``: natural logarithm of the likelihood ratio, with to without the changes,
+    of runs that were not used to find them. ``hidden_um_m``: possible undetected change of each scale and squareness. ``beside``: effects
+    found in the same runs that may have the same cause. ``proved``: whether runs that were not used to find the changes confirm them.
+    ``trouble``: why nothing could be compared.
     """
 
     since: int

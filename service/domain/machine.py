@@ -185,8 +185,8 @@ class Issuer(ConfigTable):
     address: str = Field(default="", max_length=400, description="of the laboratory: street and number")
     accreditation: str = Field(default="", max_length=200, description="body and number of the accreditation; empty: none is claimed")
     procedure: str = Field(default="", max_length=200, description="the laboratory's own procedure with its edition")
-    prefix: str = Field(default="", max_length=20, description="before the number of each certificate, e.g. CAL-")
-    customer: str = Field(default="", max_length=200, description="of the machine; empty: the laboratory itself")
+    prefix: str = Field(default="", max_length=20, description="prefix of each certificate's number, e.g. CAL-")
+    customer: str = Field(default="", max_length=200, description="owner of the machine; empty: the laboratory itself")
     customer_address: str = Field(default="", max_length=400)
     place: Literal["laboratory", "customer", "laboratoryBranch", "customerBranch", "other"] = Field(
         default="customer", description="where machines are measured, as seen from the laboratory"

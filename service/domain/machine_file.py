@@ -13,12 +13,12 @@ from abbe.service.domain.bounds import Number, Text, Word
 Origin = Literal["default", "file", "environment"]
 MOST_VALUES = 5000
 ABOUT_BYTES = 80
-"""JSON of a value beside its texts, at most."""
+"""Largest size of a value's JSON besides its key and its text, bytes."""
 
 
 @dataclass(frozen=True, slots=True)
 class StatedValue:
-    """One value in force. ``key``: dotted; ``value``: as JSON, secrets masked; ``line``: 0 unless it stands in the file."""
+    """One value in force. ``key``: dotted; ``value``: as JSON, secrets masked; ``line``: its line in the file, 0 if it is not there."""
 
     key: Word
     value: Text
@@ -28,7 +28,8 @@ class StatedValue:
 
 @dataclass(frozen=True, slots=True)
 class MachineFileSummary:
-    """The machine file as the service read it at its start. ``sha256``: of the file; ``left_out``: how many values are not among these."""
+    """The machine file as the service read it at its start. ``sha256``: of the file; ``left_out``: number of values that ``values``
+    lacks."""
 
     path: Text
     sha256: Word
@@ -36,7 +37,8 @@ class MachineFileSummary:
     left_out: Number = 0
 
     def within(self, most_bytes: int) -> MachineFileSummary:
-        """As many values as fit into so many bytes of JSON, first those of the file and the environment, then defaults."""
+        """The summary with as many values as fit into ``most_bytes`` of JSON: first those of the file and the environment, then
+        defaults."""
         kept, room = set[int](), most_bytes - len(json.dumps(self.path)) - 4 * ABOUT_BYTES
         for k in sorted(range(len(self.values)), key=lambda k: self.values[k].origin == "default"):
             one = self.values[k]
@@ -48,7 +50,7 @@ class MachineFileSummary:
         return replace(self, values=values, left_out=self.left_out + len(self.values) - len(values))
 
     def sections(self) -> dict[str, list[StatedValue]]:
-        """The values by section, in the order of the documentation; ``""``: what stands above all sections."""
+        """The values by section, in the order of the documentation; ``""``: keys above all sections."""
         found: dict[str, list[StatedValue]] = {}
         for one in self.values:
             head, dot, _ = one.key.partition(".")

@@ -123,7 +123,7 @@ class TouchedFeature:
 
     ``nominal_mm``: in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from the centre to each
     touch, machine axes; ``touches_mm``: for each side the repeated latched axis positions; ``start_deg``: direction of the first touch;
-    ``resolution_mm``: way between two looks of the control at the probe, 0: none.
+    ``resolution_mm``: travel between two readings of the probe input by the control, 0: none.
     """
 
     feature: str
@@ -260,7 +260,7 @@ class RunEnd:
 
 
 UNKNOWN = "?"
-"""Start time of a living process if the system does not show it; only its pid identifies such a process."""
+"""Stands for the start time of a living process if the system does not show it; only the pid identifies such a process."""
 _START_TIME_FIELD = 22 - 3
 """Field 22 of /proc/PID/stat, counted after the command name (field 2), which may itself hold blanks."""
 

@@ -29,7 +29,7 @@ SETUP_KEYS: dict[str, tuple[str, ...]] = {
     "laser_diagonal": ("diagonal", "start_mm", "end_mm", "increment_mm", "steps", "nominal_beam"),
     "laser_linear": ("axis", "start_mm", "end_mm"),
 }
-"""What ``setup`` must hold besides ``setup_id`` and ``t_set_s``."""
+"""Keys that ``setup`` must have besides ``setup_id`` and ``t_set_s``."""
 
 
 class SetupObject(FileObject):

@@ -58,10 +58,17 @@ class Needs:
     idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
     warm_min: Annotated[
         float,
-        Field(ge=0.0, le=50.0, description="minutes of the last 60 in which the service saw the spindle turn or an axis move, at least"),
+        Field(
+            ge=0.0,
+            le=50.0,
+            description="least number of minutes, of the last 60, in which the service saw the spindle turn or an axis move",
+        ),
     ] = 0.0
     air: Annotated[bool, Field(description="air temperature (of the laser) inside [limits] temperature_c")] = False
-    operator: Annotated[Literal["any", "present", "absent"], Field(description="by [[staffed]]; absent: the door is shut, too")] = "any"
+    operator: Annotated[
+        Literal["any", "present", "absent"],
+        Field(description="whether an operator is there, by [[staffed]]; absent also requires a shut door"),
+    ] = "any"
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,7 +120,7 @@ def one_way(schedule: Schedule) -> Schedule:
 class Window:
     """A window in time: a number of hours from each time of a cron expression, or from start to end on some days of the week.
 
-    Hours are elapsed time, also across a change of clocks; start and end are wall time.
+    Hours count elapsed time, even when the clocks change; start and end are wall time.
     """
 
     name: Name

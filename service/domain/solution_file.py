@@ -72,7 +72,7 @@ class Rank(FileObject):
 
 
 class ObservabilityNumber(FileObject):
-    """Factor by which these runs can reduce the error of a typical machine: at the worst place, at the median."""
+    """Factor by which these runs can reduce the error of a typical machine, at the worst place and at the median place."""
 
     number: float
     median: float

@@ -100,7 +100,8 @@ def without(case: Case, known_mm: dict[str, F1]) -> Case:
 ALIKE = 2.0
 """Values of a non-linear parameter that differ by fewer standard uncertainties than this count as equal, and so do their columns."""
 OPPOSITE = -0.8
-"""Below this cosine between two findings' coefficients the later finding reverses the earlier one; otherwise it is another change."""
+"""If the cosine between two findings' coefficients is below this, the later finding reverses the earlier one; otherwise it is another
+change."""
 FORM = 0.1
 """Relative standard uncertainty assumed for coefficients, because no machine follows a formula exactly."""
 LOOK = "`abbe model list` shows all versions"

@@ -28,7 +28,7 @@ NAME = "PITCH.TXT"
 LAST_POINT = 1023
 BASE = 10000
 INPUT_UNIT_MM = 1e-3
-"""A length without a decimal point counts in this unit: 90000 is 90 (a public tool's file of a rotary table); 50.0 is 50 mm."""
+"""Unit of a length without a decimal point: 90000 is 90 (in a public tool's file of a rotary table); 50.0 is 50 mm."""
 _PARAMETER = re.compile(r"N(\d{5})Q1((?:A\d+P[+-]?[\d.]+)+);?")
 _POINT = re.compile(r"N(1\d{4})(?:Q[01])?P([+-]?\d+);?")
 _VALUE = re.compile(r"A(\d+)P([+-]?[\d.]+)")

@@ -127,7 +127,7 @@ def _clock() -> Iterator[Examined]:
 
 
 def _ports(site: Site) -> Iterator[Examined]:
-    """Examine the rights on serial ports, since an error in opening one says less."""
+    """Examine the rights on serial ports, because the error from opening a port is less clear."""
     for role in site.urls.named():
         try:
             port = getattr(parse_url(getattr(site.urls, role)), "path", None)
@@ -167,7 +167,7 @@ async def _devices(site: Site) -> AsyncIterator[Examined]:
 
 
 def _answered(role: str, url: str, what: str) -> Examined:
-    """Return the line of a device that answers; the driver of a package that no report proves is to be tested first."""
+    """Return the finding about a device that answers; a driver from a package without a test report has to be tested first."""
     if installed(url) is None or split_report(url)[1]:
         return Examined(role, "good", f"{url}: {what}")
     return Examined(role, "look", f"{url}: {what}; its driver is not tested", untested_remedy(url))

@@ -47,7 +47,7 @@ from abbe.service.verification.alarm_states import TRIES, Alarm, next_step
 BESIDE = 0.5
 """Largest ratio of the unexplained readings to the gain that tables promise; above it, a remedy other than tables comes first."""
 REFUSALS = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
-"""Errors that are answers, not faults: they become the alarm's text, and another try would give the same."""
+"""Errors that end an investigation with an answer: they become the alarm's text, because another try would end in the same way."""
 
 Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
 """Writes a line of the alarm; returns the alarm including it."""
@@ -135,7 +135,7 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
 
 
 def _objections(finding: Finding, store: Store, machine: str) -> AlarmFacts:
-    """Return what speaks against tables: ``against`` (text; empty: nothing), ``rms_um`` (unexplained readings beyond noise), ``unnamed``.
+    """Return the reasons against tables: ``against`` (text; empty: none), ``rms_um`` (unexplained readings beyond noise), ``unnamed``.
 
     An effect that no table corrects is an objection unless the machine's model contains it: effects of the model are subtracted from the
     readings before tables are made. ``unnamed``: something is missing, and no effect was found for it.
@@ -174,7 +174,7 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
 async def make_proposal(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
     """Solve a measured campaign and store the result as a proposal, based on the controller's table in force.
 
-    ``agree`` and ``by`` are those of `proposals.make`; so are the errors, besides those of devices.
+    ``agree``, ``by`` and the errors are those of `proposals.make`; devices can also fail.
     """
     site, store = context.site, context.store
     with lock_machine(site.urls.cnc):
@@ -185,7 +185,8 @@ async def make_proposal(context: InvestigationContext, campaign: str, agree: Cal
 
 
 def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
-    """Refuse tables if there is an objection ``against`` them and the unexplained ``rms_um`` is not small against their promised gain.
+    """Refuse tables if there is an objection ``against`` them and the unexplained ``rms_um`` is not small beside the gain that they
+    promise.
 
     Raises
     ------

@@ -37,7 +37,7 @@ AGENT_ITEMS = (
     ("removed", "EVENT", "DEVICE_REMOVED", ""),
     ("changed", "EVENT", "DEVICE_CHANGED", ""),
 )
-"""The data items of the agent as a device, which MTConnect 1.7 and later demand."""
+"""Data items of the agent itself, which MTConnect 1.7 and later require as a device."""
 _NAMES = {"result": "last_check", "table": "compensation_table"}
 
 

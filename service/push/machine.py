@@ -34,7 +34,7 @@ from abbe.service.push.operations import (
 STILL_S = 1.0
 """The axes must have stood for this long before anything is staged."""
 LEASE_LEFT_MS = 5000
-"""With less than this left, the lease may end between the last look and the activation."""
+"""Least remaining time of the lease for an activation: with less, it may end between the last look and the activation."""
 
 
 def next_operation(journal: Journal, known: PushKnowledge, order: OperationOrder | None = None) -> Operation:

@@ -263,9 +263,9 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
 
 
 def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Yield the reason for each axis of which the table covers much that no run reached: there the map is only assumed.
+    """Yield the reason for each axis whose table extends too far beyond the positions of the runs, where the map is only assumed.
 
-    The whole grid counts, also where a correction stands still: the tables of one axis act at every position of the others.
+    The whole grid counts, even where a correction is constant: the tables of one axis act at every position of the others.
     """
     for axis, (low, high) in zip(AXES, c.evidence.reached_mm, strict=False):
         grids = [column.position_mm for column in c.columns if column.moved == axis and column.position_mm]

@@ -82,7 +82,7 @@ def step_seconds(step: Step, here: Point | None) -> tuple[float, Point | None]:
 
 
 def _touch_seconds(step: TouchFeature, here: Point | None) -> float:
-    """Time of all touches of a feature: way there and between the sides, then for every repeat to and fro."""
+    """Time of all touches of a feature: the way there and between the sides, and the way in and out of every repeat."""
     way = sum(math.dist(a, b) for a, b in pairwise(step.places_mm())) + (0.0 if here is None else math.dist(here, step.above_mm))
     touches = len(step.sides) * step.repeats
     return 60.0 * (way / step.feed_mm_min + touches * step.search_mm * (1.0 / step.touch_feed_mm_min + 1.0 / step.feed_mm_min))

@@ -1,8 +1,9 @@
 """The journal of a campaign: it records what cannot be undone, so that another process can resume.
 
-Kinds of lines: ``begun`` (plan's hash and source, controller's boot id, table, process), ``hand`` (a person was asked, and when it was
-done), ``run`` (a run of a test was opened), ``point`` (a point was read), ``done`` (a test is complete), ``waits`` and ``goes-on`` (pause,
-suspension), ``incident`` (a link failed, or recovered), ``ended``. ``docs/decisions/0016-checkpoints.md`` gives the use of each.
+Kinds of lines: ``begun`` (plan's hash and source, controller's boot id, table, process), ``hand`` (a person was asked to do a manual step,
+and when it was done), ``run`` (a run of a test was opened), ``point`` (a point was read), ``done`` (a test is complete), ``waits`` and
+``goes-on`` (pause, suspension), ``incident`` (a link failed, or recovered), ``ended``. ``docs/decisions/0016-checkpoints.md`` gives the use
+of each.
 """
 
 from __future__ import annotations

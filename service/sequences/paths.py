@@ -104,7 +104,7 @@ async def record_path(
     Raises
     ------
     BarOutOfRange, MeasurementFault, RunInterrupted, StretchDiffers, DriverError
-        The axes stop before the error leaves.
+        The axes stop before the error is raised.
     """
     controller = session.controller
     await controller.load_path(step.points_mm)

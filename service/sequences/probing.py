@@ -23,9 +23,9 @@ AGREE_MM = 0.01
 """Repeated touches of one side agree within this; a trip by vibration does not."""
 MORE_TOUCHES = 3
 RADIUS_MM = 0.05
-"""Allowed difference of the radius that a feature shows from the expected one: pre-travel and a hole's tolerance, but no other stylus."""
+"""Allowed difference between measured and expected radius of a feature: it covers pre-travel and a hole's tolerance, not another stylus."""
 MOVED_MM = 0.01
-"""Allowed change of a feature that is touched again: minutes of drift, but no plate that has slipped."""
+"""Allowed change of a feature that is touched again: it covers minutes of drift, not a plate that has slipped."""
 TOUCH_S = 30.0
 RESEAT_S, POLL_S = 1.0, 0.02
 """How long a stylus may take to come back to rest after a touch (receivers report it late), and how often this is asked."""
@@ -75,7 +75,7 @@ class FeatureTouch:
     asked: Callable[[], bool] = lambda: False
     false_trips: int = 0
     out: list[Point] = field(default_factory=list)
-    """The way out of the feature, last place first to leave."""
+    """Places on the way out of the feature, to be passed from the last to the first."""
     _period_s: float = 0.0
 
     async def run(self) -> dict[str, Any] | None:

@@ -130,7 +130,7 @@ class Runner:
         Raises
         ------
         Interlock, Stopped, Aborted, RunInterrupted, SetupDisturbed, MeasurementFault, DriverError
-            The axes stop before the error leaves.
+            The axes stop before the error is raised.
         """
         attempt = attempt or Attempt()
         self._remainder = attempt.remainder

@@ -36,7 +36,7 @@ RETRY_S = 0.02
 LATE_S = 0.1
 """A wake-up that is later than this, s, means that this computer stalled: the watcher asks once more before it calls the status unknown."""
 LOOK_S = 0.05
-"""Time between two looks whether this computer stalls."""
+"""Time between two checks for a stall of this computer."""
 NOTHING: frozenset[str] = frozenset()
 END_S = 5.0
 """Longest wait for the watchers' current poll when the test has ended."""
@@ -232,7 +232,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
     Raises
     ------
     StatusUnknown
-        No reply within ``unknown_s``. If this computer stalled meanwhile, even if the stall ended before that, the controller gets the time
+        No reply within ``unknown_s``. After a stall of this computer in that time, even one that is over, the controller gets ``unknown_s``
         once more.
     Rebooted
         The controller restarted.
@@ -263,7 +263,8 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
 
 
 class Stalls:
-    """While it is open: ``longest_s``, the longest time, s, for which this computer did not run the event loop; measured every `LOOK_S`."""
+    """Measures stalls of this computer while it is open. ``longest_s``: longest time, s, without the event loop; measured every
+    `LOOK_S`."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0

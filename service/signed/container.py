@@ -116,7 +116,7 @@ def _check_files(claims: Claims, files: Mapping[str, bytes]) -> None:
 
 @dataclass(frozen=True, slots=True)
 class _Sealed:
-    """The keys of a .sig file, of which none may be missing and no other may stand there."""
+    """The keys of a .sig file: all of them are required, and no others are allowed."""
 
     format: str
     key: str

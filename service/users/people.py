@@ -267,8 +267,8 @@ class UserAccounts:
     def by_session(self, secret: str, *, in_use: bool = True, to_stop: bool = False) -> Principal:
         """Owner of a session's secret; `ANONYMOUS` if the session has ended, is idle or too old, or its user is disabled.
 
-        ``in_use`` False: this request does not count as use of the session. ``to_stop``: the request stops the machine, which a session
-        that is idle or too old still may.
+        ``in_use`` False: this request does not count as use of the session. ``to_stop``: the request stops the machine, which even an idle
+        or too old session may do.
         """
         digest = digest_of(secret)
         found = self._store.people.session(digest)

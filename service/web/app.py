@@ -236,7 +236,7 @@ MANIFEST = {
     "theme_color": "#22506e",
     "icons": [{"src": "/icon.svg", "sizes": "any", "type": "image/svg+xml", "purpose": "any maskable"}],
 }
-"""With it a browser installs the page as a program of a panel or a phone."""
+"""The manifest with which a browser installs the page as a program on a panel or a phone."""
 
 
 def _add_installable(app: FastAPI) -> None:

@@ -21,10 +21,10 @@ SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 class News:
     """Finds the checks and alarms that were not shown before.
 
-    Facts hold only the newest alarms. If one leaves the full list, an older alarm returns to it: that one is not new. The time of an alarm
-    is that at which its check began, so alarms may not arrive in order of time.
+    Facts hold only the newest alarms. If one leaves the full list, an older alarm returns to it, which is not new. An alarm has the time at
+    which its check began, so alarms may arrive out of order.
 
-    ``since``: a check that ended, or an alarm that rose, before this time and before the first facts is not new.
+    ``since``: checks that ended before this time, and alarms of the first facts from before this time, are not new.
     """
 
     def __init__(self, since: datetime) -> None:

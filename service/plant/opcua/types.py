@@ -2,8 +2,8 @@
 
 With the nodesets of DI, IA, Machinery (OPC 40001-1) and MachineTool (OPC 40501-1) at hand, the machine is a MachineToolType in the folder
 ``Machines``, and events are NotificationEventTypes. Without them the same types derive from those of the standard. An alarm is no
-AlertType: that is a condition which clients may acknowledge, and here nothing can be written. OPC 40210 is not used: no
-package holds its nodeset.
+AlertType, because clients may acknowledge an AlertType, and here nothing can be written. OPC 40210 is not used, because no package holds
+its nodeset.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from asyncua import Node, Server, ua
 
 NODESETS = Path(__file__).resolve().parent / "nodesets"
 COMPANIONS = tuple(f"Opc.Ua.{name}.NodeSet2.xml" for name in ("Di", "IA", "Machinery", "MachineTool"))
-"""In the order in which each needs those before it."""
+"""Nodesets of the companion specifications, each after those that it needs."""
 MACHINERY, MACHINE_TOOL = (f"http://opcfoundation.org/UA/{name}/" for name in ("Machinery", "MachineTool"))
 MACHINES, MACHINE_TOOL_TYPE, NOTIFICATION_EVENT_TYPE = 1001, 13, 35
 """Node ids: the folder of the machines (Machinery); types of a machine tool and of a notification (MachineTool)."""

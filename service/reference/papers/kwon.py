@@ -215,7 +215,7 @@ def _sums() -> list[Comparison]:
         why = f"{share} % off. Table 1 and Table 2 check each other: N = 81, coordinates in mm (± 1 mm, assumed), sums about the mean"
         how, how_other = (f"{grid}, Table 1 at Z = {z:.3f} mm" for z in (used, other))
         quantity = f"regression sum of squares of {c}"
-        no_fit = "at the plane that the paper states the sums do not fit: it is not the plane of the fit"
+        no_fit = "the sums do not fit at the plane that the paper states: it is not the plane of the fit"
         out += [
             Comparison("Table 2", quantity, "mm²", number, here, how, why),
             Comparison("Table 2", f"{quantity}, printed Z", "mm²", number, there, how_other, no_fit, again=True),

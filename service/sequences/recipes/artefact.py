@@ -25,7 +25,7 @@ from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, St
 
 BALL, HOLE = "xyz", "xy"
 LARGEST_TILT_DEG = 2.0
-"""Of a hole's axis against the stylus: more may bring its shaft to the wall."""
+"""Largest tilt of a hole's axis against the stylus; beyond it the shaft of the stylus may touch the wall."""
 WAY_POINTS = 9
 Angle = Annotated[float, Limits(ge=-360.0, le=360.0)]
 Millimetres = Annotated[float, Limits(gt=0.0, le=500.0)]

@@ -272,7 +272,7 @@ BarRecipe = Helix | HelixPoints | Circle
 
 
 def _bar_plan(recipe: BarRecipe, test: str, machine: Machine, path: Doc, again: Doc, steps: list[Step]) -> TestPlan:
-    """Return the plan of a ball-bar test; ``again``: what else it takes to drive the same path again."""
+    """Return the plan of a ball-bar test; ``again``: further values that are needed to drive the same path again."""
     setup = {
         "setup_id": recipe.setup_id,
         "centre_mm": list(recipe.centre_mm),

@@ -14,13 +14,13 @@ from uvicorn.protocols.http.flow_control import service_unavailable
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
 HEADERS_S = 10.0
-"""From the connection, or from the previous answer, to the end of a request's headers."""
+"""Longest time, s, from the connection, or from the previous answer, to the end of a request's headers."""
 BODY_S = 20.0
-"""From the headers to the end of the body: forms are short."""
+"""Longest time, s, from the headers to the end of the body: forms are short."""
 LINGER_S = 2.0
-"""How long the rest of a refused body is read and discarded: a client that is cut off while sending may never read the answer."""
+"""Time, s, for which the rest of a refused body is read and discarded: a client that is cut off while sending may never read the answer."""
 READ_S = 30.0
-"""How long an answer may wait after the client stops reading."""
+"""Longest time, s, that an answer may wait after the client stops reading."""
 MOST_CONNECTIONS = 200
 MOST_BUSY = 100
 

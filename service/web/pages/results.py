@@ -99,7 +99,7 @@ def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, flo
 
 
 MOST_SOLUTIONS = 20
-"""A stored solution has half a megabyte: more of them would make the list slow."""
+"""Number of solutions in the list: a stored one has half a megabyte, and more would make the list slow."""
 
 
 @dataclass(frozen=True, slots=True)

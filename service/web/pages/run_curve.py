@@ -14,13 +14,13 @@ from abbe.service.web.frame import current
 
 NOTHING: Doc = {"x": [], "low": [], "high": [], "whole": [0.0, 0.0], "readings": 0}
 PARTS = 1000
-"""As many parts as a screen has columns, about; a shown time with fewer readings than twice that is sent reading by reading."""
+"""Number of parts, about that of a screen's columns; if the shown time has fewer than twice as many readings, each of them is sent."""
 
 
 def envelope(x: F1, y: F1, low: float, high: float) -> tuple[F1, F1, F1]:
     """Middle, least and largest reading of each part of ``x`` from ``low`` to ``high``; the readings themselves if there are few.
 
-    ``x``: growing, shape (n,). The last reading before and the first one after are taken along, so that lines reach the edges.
+    ``x``: growing, shape (n,). The last reading before and the first one after are included, so that lines reach the edges.
     """
     first = max(int(np.searchsorted(x, low)) - 1, 0)
     last = min(int(np.searchsorted(x, high, side="right")) + 1, len(x))
@@ -51,7 +51,7 @@ def run_curve(store: Store, number: int, low: float, high: float) -> Doc:
 
 @lru_cache(1)
 def _readings(store: Store, number: int) -> tuple[F1, F1]:
-    """The valid readings of the run that is being looked at; a stored run does not change."""
+    """The valid readings of the run on the screen, cached since a stored run does not change."""
     columns = load_run(store, number).columns
     deviation_mm = np.empty(0) if columns.deviation_mm is None else columns.deviation_mm
     t_s = columns.t_s[: deviation_mm.size]

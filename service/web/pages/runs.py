@@ -92,7 +92,7 @@ def run_screen(store: Store, record: RunRecord, rules: Rules) -> RunScreen:
 
 
 LONG_RUN = 100_000
-"""A run of more readings is shown without its report at first: making that takes seconds."""
+"""A run with more readings is first shown without its report, since making the report takes seconds."""
 
 
 def readings_of(store: Store, number: int) -> int:

@@ -192,7 +192,7 @@ def test_columns_that_contradict_the_positions_are_flagged_by_name():
     feed, direction = column_issues(runs_of(good))
     driven = good[0]["columns"]["feed_mm_min"][0]
     assert feed.line.startswith(f"run c: feed_mm_min says {4 * driven:.0f}, its positions and times say {driven:.0f} mm/min")
-    assert direction.line.startswith("run b: its column direction contradicts the sense in which its positions turn")
+    assert direction.line.startswith("run b: its column direction contradicts the sense of rotation of its positions")
     assert not feed.refuse
     assert not direction.refuse
 

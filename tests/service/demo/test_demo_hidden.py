@@ -61,7 +61,7 @@ def test_only_the_hidden_name_and_no_other_is_right(hidden, answer, right):
 def test_the_truth_is_told_with_its_size_and_shape():
     assert truth_lines(demo(PLAY, "none"))[1] == "  its true parameters: strength 6; its shape deviates from the formula in the catalogue"
     assert truth_lines(demo(SURGE, "unknown"))[1] == "  its true parameters: strength 4"
-    assert "but so was vibration:Y, which is not there" in judged(demo(PLAY, "named", "lateral_play:EYX", "vibration:Y"))[1]
+    assert "but so was vibration:Y, which is not in the machine" in judged(demo(PLAY, "named", "lateral_play:EYX", "vibration:Y"))[1]
 
 
 def test_json_has_the_answer_and_the_truth_apart():

@@ -174,7 +174,7 @@ def test_a_trace_asks_for_its_unit_and_place(abbe: Abbe) -> None:
     assert "the file does not say the unit of the readings - give --unit VALUE" in abbe.fails("import", "d.rtx", "--yes", "--axis", "X")
     assert abbe("import", "d.rtx", "--yes", "--axis", "X", "--unit", "um", "--at", "100").code == 0
     assert abbe("report", "d", "--out", "d.json").code == 0
-    assert "the axis stood still: readings over time show no geometry" in abbe("discover", "d").err
+    assert "the axis stood still: its readings over time hold no geometry" in abbe("discover", "d").err
 
 
 def test_a_table_is_read_by_its_column_file(abbe: Abbe) -> None:
