@@ -6,9 +6,9 @@ control itself refuses writes while its table acts, and refuses to switch on a t
 never acts. An interruption leaves compensation off; the push then restores the old table from its journal. A crash loses the staged
 table and the lease: they exist only in this process.
 
-Weaker than two banks (docs/decisions/0044-one-table.md): no table acts during the exchange; Abbe checks the interlocks before each switch, but the
-control does not check them at that instant; there is no lease, so no other program may write tables; if the origin of the content is
-unknown, a person must decide.
+Weaker than two banks (docs/decisions/0044-one-table.md): no table acts during the exchange; Abbe checks the interlocks before each switch,
+but the control does not check them at that instant; there is no lease, so no other program may write tables; if the origin of the content
+is unknown, a person must decide.
 """
 
 from __future__ import annotations
