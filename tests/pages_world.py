@@ -81,6 +81,7 @@ class Filled:
     solution: int
     proposals: list[int]
     discovery: int
+    checks: int = 24
 
 
 def _solved(_folder: Path) -> tuple[Solved, str]:
@@ -109,8 +110,8 @@ def filled_once(factory: pytest.TempPathFactory) -> Filled:
     return replace(filled, url=f"sqlite:///{folder / 'abbe.sqlite3'}")
 
 
-def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: int = 24) -> Filled:
-    """Fill a new store with campaign, solution, discovery, proposals, checks and slots."""
+def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: int = 24, days: int = 7) -> Filled:
+    """Fill a new store with campaign, solution, discovery, proposals, slots and checks, ``days`` apart; they drift as in 24 weeks."""
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
     machine = f"mill-7{evil}"
     schedules = [Schedule(f"weekly{evil}", "0 6 * * 1", "Europe/Berlin", f"quick-check{evil}"),
@@ -122,7 +123,7 @@ def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: 
         campaign = f"june{evil}"
         _import(store, folder / "in", campaign, site, runs)
         labels = [run["run_id"] for run in runs if run["test"] in {"ballbar_helix", "laser_diagonal"}]
-        _checks(store, site, schedules[0], checks, evil, Measured(campaign, labels))
+        _checks(store, site, schedules[0], Pace(checks, days), evil, Measured(campaign, labels))
         _broken_run(store, campaign, evil)
         stored = store.campaigns.find(campaign)
         ids = [r.id for r in store.runs.all(stored.id) if r.visible_status == "complete"]
@@ -134,7 +135,7 @@ def fill(factory: pytest.TempPathFactory, folder: Path, evil: str = "", checks: 
             aside.submit(lambda: asyncio.run(_pushes(store, machine, evil))).result()
         proposals = _proposals(store, site, runs, solved, campaign, solution, evil)
         add_alarms(store, machine, schedules[0], proposals[-1], evil)
-        return Filled(url, machine, schedules, devices, campaign, solution, proposals, _discovery(store, folder / "c1", evil))
+        return Filled(url, machine, schedules, devices, campaign, solution, proposals, _discovery(store, folder / "c1", evil), checks)
 
 
 @dataclass(frozen=True)
@@ -145,22 +146,31 @@ class Measured:
     labels: list[str]
 
 
-def _checks(store: Store, site: Site, schedule: Schedule, count: int, evil: str, known: Measured) -> None:
-    machine = site.name
+@dataclass(frozen=True)
+class Pace:
+    """Number of checks, and the days between them."""
+
+    count: int
+    days: int
+
+
+def _checks(store: Store, site: Site, schedule: Schedule, pace: Pace, evil: str, known: Measured) -> None:
+    machine, count = site.name, pace.count
     now, number = datetime.now(UTC), store.machines.add(machine, site.doc)
-    for week in range(count):
-        at = now - timedelta(days=7 * (count - 1 - week), hours=3)
+    for k in range(count):
+        at = now - timedelta(days=pace.days * (count - 1 - k), hours=3)
         occasion = verify.Occasion(machine, schedule, at)
-        if week == count - 3:
+        if k == count - 3:
             trouble = LinkDown(f"modbus+tcp://127.0.0.1:5021{evil}", "connect", f"refused{evil}", f"is the laser on?{evil}")
             store.verifications.add_with_messages(number, verify.failed_doc(occasion, trouble, at, 5.0), [])
             continue
+        week = k * 23.0 / (count - 1)
         drift = 11.0 + 0.02 * week**2
         verdict = "fail" if drift - 1.1 > 20 else "pass" if drift + 1.1 <= 20 else "cannot tell"
         values = {"diagonal_ppp_um": drift - 3, "body_diagonal_um": drift, "helix_rms_um": 1.2 + 0.1 * week}
         told = Result(verdict, values, text=f"{verdict}: worst body diagonal {drift:.1f} µm{evil}", started_utc=at, duration_s=312.0,
-                      campaign=f"quick-check {week}{evil}")  # fmt: skip
-        if week in {count - 5, count - 1}:
+                      campaign=f"quick-check {k}{evil}")  # fmt: skip
+        if k in {count - 5, count - 1}:
             told = replace(told, campaign=known.campaign, run_labels=tuple(known.labels))
         store.verifications.add_with_messages(number, verify.check_doc(occasion, told), [])
 
@@ -346,5 +356,5 @@ def screens(filled: Filled) -> list[str]:
     found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=2&run=3"]
     plant = ["/fleet", "/devices", "/settings"]
     first = ["/", "/new", "/runs", *runs, "/results", "/discoveries", *found]
-    alarms = ["/alarms", "/alarm?id=1", "/alarm?id=2", "/check?id=24", "/check?id=22"]
+    alarms = ["/alarms", "/alarm?id=1", "/alarm?id=2", f"/check?id={filled.checks}", f"/check?id={filled.checks - 2}"]
     return [*first, *alarms, "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]

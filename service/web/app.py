@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse, JSONResponse, Response
+from starlette.middleware.gzip import GZipMiddleware
 from starlette.middleware.trustedhost import TrustedHostMiddleware
 from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
@@ -160,7 +161,8 @@ def create_app(
         add_table_orders(app, parts.core)
         add_live(app, parts.core)
         add_metrics(app, parts.store, parts.core, parts.machine, parts.control)
-    app.mount("/static", StaticFiles(directory=HERE / "static"), name="static")
+    # Only these are compressed: what holds a person's token beside texts that others can set would tell it by its length.
+    app.mount("/static", GZipMiddleware(StaticFiles(directory=HERE / "static"), minimum_size=1000), name="static")
     app.add_middleware(FrameMiddleware, routes=app.router.routes, behind_tls=app.behind_tls)  # inside AuthMiddleware
     app.add_middleware(AuthMiddleware, routes=app.router.routes, auth=auth)
     app.add_middleware(TrustedHostMiddleware, allowed_hosts=[as_in_host_header(host) for host in hosts])

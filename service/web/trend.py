@@ -13,6 +13,8 @@ from abbe.service.web.formatting import number
 
 WIDTH, HEIGHT = 560, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
+MANY = 120
+"""More points than this stand too close to be pointed at: those that look alike are one path."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,8 +54,11 @@ def trend_svg(name: str, unit: str, points: Sequence[Point], zone: tzinfo, chang
     x, y = _time_scale(points, changes), _value_scale(points)
     label = f"{name} [{unit}]" if unit else name
     body = [*_grid(y), *_dates(points, x, zone), *_limit(points, x, y), *_changes(changes, x)]
-    for point in points:
-        body += _mark(point, x(point.at.timestamp()), y, unit)
+    if len(points) > MANY:
+        body += _joined(points, x, y)
+    else:
+        for point in points:
+            body += _mark(point, x(point.at.timestamp()), y, unit)
     body.append(f'<text class="axis" x="{LEFT}" y="11">{escape(label)}</text>')
     newest = points[-1]
     title = f"{name}: {len(points)} checks, latest {number(newest.value)} {unit}"
@@ -135,6 +140,20 @@ def _limit(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]
         # Beside the plot, not in it: the newest point may lie on the limit.
         f'<text class="limit-text" x="{WIDTH - RIGHT + 5}" y="{last_y + 4:.1f}">limit</text>',
     ]
+
+
+SHAPES = {"pass": "h0", "fail": "m-3 -3l6 6m0 -6l-6 6", "unclear": "m0 -3l3 3l-3 3l-3 -3z"}
+
+
+def _joined(points: Sequence[Point], x: _PixelScale, y: _PixelScale) -> list[str]:
+    """Uncertainty bars and marks of many points: a path for the bars, and one for each kind of mark."""
+    paths: dict[str, list[str]] = {"bar": []}
+    for point in points:
+        px = f"{x(point.at.timestamp()):.1f}"
+        paths["bar"].append(f"M{px} {y(point.value + point.uncertainty):.1f}V{y(point.value - point.uncertainty):.1f}")
+        look = point.verdict if point.verdict in SHAPES else "unclear"
+        paths.setdefault(f"many {look}{' earlier' if point.earlier else ''}", []).append(f"M{px} {y(point.value):.1f}{SHAPES[look]}")
+    return [f'<path class="{look}" d="{"".join(parts)}"/>' for look, parts in paths.items()]
 
 
 def _mark(point: Point, px: float, y: _PixelScale, unit: str) -> list[str]:

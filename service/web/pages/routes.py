@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import secrets
+from functools import partial
 from typing import Annotated
 
 from fastapi import FastAPI, Query, Request
@@ -25,6 +26,7 @@ from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.login import signature_refusal
+from abbe.service.web.page import has_uplot
 from abbe.service.web.pages import times
 from abbe.service.web.pages.context import Number, PageContext, can_be_stored, find_or_none
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
@@ -217,13 +219,13 @@ def _approval(fields: dict[str, str]) -> tuple[int, float] | None:
 def _add_times(app: FastAPI, context: PageContext) -> None:
     @app.get("/trends", include_in_schema=False)
     @needs(Permission.READ)
-    async def trends() -> HTMLResponse:
+    async def trends(pictures: bool = False) -> HTMLResponse:
+        pictures = pictures or not has_uplot()
         past, status = await context.source.verifications(times.CHECKS), await context.source.status()
-        screen = await context.read(times.trend_screen, context.reader, past, status)
+        screen = await context.read(partial(times.trend_screen, context.reader, past, status, pictures=pictures))
         words = {key: current().translate(key) for key in times.PLOT_WORDS}
-        return await context.show(
-            "trends.html", verified=status.verified, plots=screen.plots, charts=screen.charts, checks=len(past), words=words
-        )
+        values = {"plots": screen.plots, "charts": screen.charts, "checks": len(past), "words": words, "pictures": pictures}
+        return await context.show("trends.html", verified=status.verified, **values)
 
     @app.get("/schedule", include_in_schema=False)
     @needs(Permission.READ)

@@ -9,6 +9,7 @@ from datetime import datetime, timedelta, tzinfo
 import numpy as np
 from markupsafe import Markup
 
+from abbe.models.arrays import F1
 from abbe.models.trend import CUSUM_H
 from abbe.service.domain.document import Doc
 from abbe.service.domain.service_records import SlotRecord
@@ -46,10 +47,10 @@ class TrendLine:
 
 @dataclass(frozen=True, slots=True)
 class TrendPlot:
-    """All checks of a figure as a picture, and as the series that the page's script draws; None: it has no control chart."""
+    """All checks of a figure: the series that the page's script draws or, where it draws none, a picture."""
 
-    picture: Markup
-    series: dict[str, object] | None
+    picture: Markup | None
+    series: Doc | None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,8 +70,8 @@ class ScheduleLine:
     slots: Sequence[SlotRecord]
 
 
-def trend_screen(reader: Reader, past: Sequence[Verification], status: Status) -> TrendScreen:
-    """Plots and control charts of the judged figures; ``past``: checks, newest first."""
+def trend_screen(reader: Reader, past: Sequence[Verification], status: Status, *, pictures: bool) -> TrendScreen:
+    """Plots and control charts of the judged figures; ``past``: checks, newest first; ``pictures``: no script draws."""
     zone, changes = zone_of(status), status.verified.changes
     found = {one.figure: one for one in charts(reader, status.machine, status.verified.since, CHECKS)}
     known = alarms(reader.store, status.machine, every=True)
@@ -78,9 +79,9 @@ def trend_screen(reader: Reader, past: Sequence[Verification], status: Status) -
     for key in figures(past):
         points = points_of(past, key, changes)
         if points:
-            chart = found.get(key)
+            chart = None if pictures else found.get(key)
             series = None if chart is None else trend_series(chart, points, zone, _marks(key, changes, known))
-            plots.append(TrendPlot(trend_picture(key, points, zone, changes), series))
+            plots.append(TrendPlot(trend_picture(key, points, zone, changes) if series is None else None, series))
     return TrendScreen(plots, [_line(one.as_trend) for one in found.values()])
 
 
@@ -98,11 +99,17 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
 
 
 def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
-    """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970."""
+    """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970.
+
+    ``value``, ``u``: as text, rounded together, between spaces. Columns of the chart have a place for each point, None where it has none.
+    """
     frame = current()
     name, unit = language.figure(frame.lang, chart.figure)
     points = sorted(points, key=lambda point: point.at)
     shown = [with_uncertainty(point.value, point.uncertainty / 2.0 or None) for point in points]
+    place = {_s(at): k for k, at in enumerate(chart.at)}
+    at = [place.get(_s(point.at)) for point in points]
+    limits = [None if point.limit is None else _short(point.limit) for point in points]
     found = chart.found
     return {
         "key": chart.figure,
@@ -110,23 +117,21 @@ def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, mark
         "unit": frame.unit(unit),
         "zone": str(zone),
         "x": [_s(point.at) for point in points],
-        "y": [_short(point.value) for point in points],
-        "u": [_short(point.uncertainty) for point in points],
-        "shown": shown,
-        "limit": [None if point.limit is None else _short(point.limit) for point in points],
-        "verdict": [VERDICTS.index(point.verdict) for point in points],
-        "earlier": [int(point.earlier) for point in points],
+        "value": " ".join(value for value, _ in shown),
+        "u": " ".join(u for _, u in shown),
+        "limit": [[k, one] for k, one in enumerate(limits) if not k or one != limits[k - 1]],
+        "verdict": "".join(str(VERDICTS.index(point.verdict)) for point in points),
+        "earlier": sum(point.earlier for point in points),
         "check": [int(point.href.rpartition("=")[2]) for point in points],
         "centre": _short(converted(chart.centre, unit, frame.units)),
         "cone": _cone(chart, unit),
         "marks": [{"at": _s(at), "kind": kind, "sign": sign, "text": text} for at, kind, sign, text in marks],
         "chart": {
-            "x": [_s(at) for at in chart.at],
             "h": CUSUM_H,
-            "high": [_short(v) for v in found.high],
-            "low": [_short(v) for v in found.low],
-            "ewma": [_short(v) for v in found.ewma],
-            "ewma_limit": [_short(v) for v in found.ewma_limit],
+            "high": _column(found.high, at),
+            "low": _column(found.low, at),
+            "ewma": _column(found.ewma, at),
+            "ewma_limit": _column(found.ewma_limit, at),
         },
     }
 
@@ -146,8 +151,13 @@ def _s(at: datetime) -> int:
     return round(at.timestamp())
 
 
-def _short(value: float) -> float | None:
-    return float(f"{value:.6g}") if np.isfinite(value) else None
+def _short(value: float, digits: int = 6) -> float | None:
+    return float(f"{value:.{digits}g}") if np.isfinite(value) else None
+
+
+def _column(values: F1, at: Sequence[int | None]) -> list[float | None]:
+    """Values of a chart in the places of the points, to the digits that a screen can show."""
+    return [None if k is None else _short(values[k], 4) for k in at]
 
 
 def _line(one: FigureTrend) -> TrendLine:

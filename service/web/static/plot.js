@@ -252,6 +252,7 @@ class Readings extends Box {
     const host = this.box.querySelector("[data-part=main]");
     host.replaceChildren();
     const line = { stroke: colours.accent, width: 1, points: { show: false } };
+    this.begun = false;
     this.main = new Plot(host, {
       scales: { x: { time: false, range: (_, min, max) => [min, max] }, y: { range: (_, min, max) => uPlot.rangeNum(min, max, 0.08, true) } },
       padding: [12, 12, 0, 0],
@@ -264,6 +265,8 @@ class Readings extends Box {
   }
 
   ask() {
+    // The first range is that of the readings that are here.
+    if (!this.begun) { this.begun = true; return; }
     clearTimeout(this.waiting);
     this.waiting = setTimeout(async () => {
       const { main, told } = this;
@@ -299,9 +302,7 @@ async function readings(run, low = -1e12, high = 1e12) {
 
 class Trend extends Box {
   constructor(box, words) {
-    super(box, JSON.parse(box.dataset.plot), words);
-    this.told.index = new Map(this.told.chart.x.map((at, k) => [at, k]));
-    box.querySelector("svg").remove();
+    super(box, opened(JSON.parse(box.dataset.plot)), words);
     this.begin();
   }
 
@@ -334,9 +335,8 @@ class Trend extends Box {
       series: [{}, { show: true, stroke: "transparent", points: { show: false } }, { stroke: colours.fail, dash: [6, 4], points: { show: false }, spanGaps: true }],
       hooks: { drawAxes: [(u) => this.behind(u, colours)], draw: [(u) => this.points(u, colours)], setScale: [(u, key) => key === "x" && this.follow(u)] },
     }, [[ends[0], ...told.x, ends[1]], padded(told.y), [limits[0] ?? null, ...told.limit, limits.at(-1) ?? null]], 300, (at) => this.tell(at === null ? null : at - 1));
-    const of = (list, by) => told.x.map((at) => (told.index.has(at) ? list[told.index.get(at)] / by(told.index.get(at)) : null));
     const { chart } = told;
-    const ewma = of(chart.ewma.map((one) => one ?? NaN), (k) => chart.ewma_limit[k]).map((one) => (Number.isFinite(one) ? one : null));
+    const of = (list, by) => list.map((one, k) => (one === null ? null : one / by(k)));
     const curve = (stroke, dash) => ({ stroke, dash, width: 1.5, spanGaps: true, points: { show: false } });
     this.chart = new Plot(below, {
       scales: { x: scales.x, y: { range: (_, min, max) => [Math.min(-1.15, min ?? 0), Math.max(1.15, max ?? 0)] } },
@@ -346,7 +346,7 @@ class Trend extends Box {
       hooks: { draw: [(u) => inside(u, (pen, x, y, b) => {
         for (const one of [1, -1]) line(pen, [[b.left, y(one)], [b.left + b.width, y(one)]], colours.fail, { dash: [6, 4] });
       })] },
-    }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(ewma)], 150, (at) => this.tell(at === null ? null : at - 1));
+    }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(of(chart.ewma, (k) => chart.ewma_limit[k]))], 150, (at) => this.tell(at === null ? null : at - 1));
     this.main.show(...ends);
   }
 
@@ -359,7 +359,7 @@ class Trend extends Box {
   behind(u, colours) {
     const { told } = this;
     inside(u, (pen, x, y, b) => {
-      if (told.centre !== null) line(pen, [[x(told.chart.x[0]), y(told.centre)], [b.left + b.width, y(told.centre)]], colours.quiet);
+      if (told.centre !== null) line(pen, [[x(told.begins), y(told.centre)], [b.left + b.width, y(told.centre)]], colours.quiet);
       if (told.cone) {
         const { at, value, low, days, high, limit } = told.cone;
         pen.fillStyle = colours.accent;
@@ -395,7 +395,7 @@ class Trend extends Box {
       };
       told.x.forEach((at, k) => {
         if (at < min || at > max) return;
-        const { word, bars, marks } = of(VERDICTS[told.verdict[k]], told.earlier[k]);
+        const { word, bars, marks } = of(VERDICTS[told.verdict[k]], k < told.earlier);
         const [px, py] = [x(at), y(told.y[k])];
         if (told.u[k]) {
           const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
@@ -433,12 +433,12 @@ class Trend extends Box {
 
   say(k) {
     const { told, words } = this;
-    const c = told.index.get(told.x[k]);
+    const { high, low, h, ewma } = told.chart;
     const value = fill(words["plot.at"], {
       when: this.when(told.x[k]), value: told.shown[k][0], u: told.shown[k][1], unit: told.unit,
       verdict: words[`verdict.${VERDICTS[told.verdict[k]]}`], check: told.check[k],
     });
-    const chart = c === undefined ? "" : ` · CUSUM ↑ ${told.chart.high[c].toFixed(1)} ↓ ${told.chart.low[c].toFixed(1)} (${told.chart.h}) · EWMA ${told.chart.ewma[c] === null ? "–" : told.chart.ewma[c].toFixed(2)}`;
+    const chart = high[k] === null ? "" : ` · CUSUM ↑ ${high[k].toFixed(1)} ↓ ${low[k].toFixed(1)} (${h}) · EWMA ${ewma[k] === null ? "–" : ewma[k].toFixed(2)}`;
     const marks = told.marks.filter((mark) => Math.abs(mark.at - told.x[k]) < 43200).map((mark) => ` · ${mark.sign} ${mark.text}`);
     this.out.textContent = value + chart + marks.join("");
     const link = this.box.querySelector("a.open");
@@ -451,11 +451,19 @@ class Trend extends Box {
     const { told } = this;
     const head = ["check", "time", `${told.key} [${told.unit}]`, `U (k=2) [${told.unit}]`, `limit [${told.unit}]`, "verdict", "CUSUM high", "CUSUM low", "EWMA"];
     return [head, ...told.x.map((at, k) => {
-      const c = told.index.get(at);
-      const chart = c === undefined ? ["", "", ""] : [told.chart.high[c], told.chart.low[c], told.chart.ewma[c]];
+      const chart = [told.chart.high[k], told.chart.low[k], told.chart.ewma[k]];
       return [told.check[k], new Date(at * 1e3).toISOString(), told.y[k], told.u[k] || "", told.limit[k], VERDICTS[told.verdict[k]], ...chart];
     })];
   }
+}
+
+// The series as they are drawn: value and U come as text, a limit as the points from which it holds.
+function opened(told) {
+  const texts = [told.value, told.u].map((text) => text.split(" "));
+  const [y, u] = texts.map((list) => list.map((text) => Number(text.replace("−", "-")) || 0));
+  const limit = told.x.map((_, k) => told.limit.findLast(([from]) => from <= k)[1]);
+  const begins = told.x[told.chart.high.findIndex((one) => one !== null)];
+  return { ...told, y, u, limit, begins, shown: texts[0].map((text, k) => [text, texts[1][k]]) };
 }
 
 // Times in s since 1970 as dates that are shifted to a zone. One formatter for all: uPlot's own makes one for each tick of each frame.
@@ -486,6 +494,7 @@ if (uPlot) {
   boxes.push(...[...document.querySelectorAll("[data-plot]")].map((box) => new Trend(box, words)));
   boxes.push(...[...document.querySelectorAll("[data-curve]")].map((box) => new Curve(box)));
   document.querySelectorAll("[data-run]").forEach((box) => Readings.of(box));
+  document.getElementById("still")?.remove();
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => boxes.forEach((one) => one.build()));
   document.documentElement.dataset.plotted = "yes";
 }

@@ -24,7 +24,7 @@ from abbe.service.web import formatting
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS
 from abbe.service.web.page import figure_verdict
-from abbe.service.web.trend import Point, trend_svg
+from abbe.service.web.trend import MANY, Point, trend_svg
 from tests.service.core.fakes import STEP, FakeClock, Result, utc
 
 NOW = utc(2026, 11, 21, 9)
@@ -200,6 +200,18 @@ def test_trend_is_well_formed_for_any_number_of_points(count: int) -> None:
         for axis, size in (("x", width), ("cx", width), ("y", height), ("cy", height)):
             assert 0 <= float(element.attrib.get(axis, 0)) <= size
     assert "nan" not in ElementTree.tostring(root, "unicode")
+
+
+def test_many_points_are_few_paths() -> None:
+    verdicts = ("pass", "fail", "cannot tell")
+    points = [Point(NOW + timedelta(days=i), 10.0 + i % 5, 1.0, 20.0, verdicts[i % 3], i < 30) for i in range(MANY + 1)]
+    root = ElementTree.fromstring(trend_svg("x", "µm", points, utc(2026, 1, 1).tzinfo))  # type: ignore[arg-type]
+    found = {one.attrib["class"]: one.attrib["d"].count("M") for one in root.iter() if one.tag.endswith("path")}
+    found.pop("limit")
+    assert found.pop("bar") == MANY + 1
+    assert found == {
+        f"many {look}{old}": n for look in ("pass", "fail", "unclear") for old, n in (("", 31 if look == "pass" else 30), (" earlier", 10))
+    }
 
 
 def test_trend_survives_figures_without_size_or_limit() -> None:

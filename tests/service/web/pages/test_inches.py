@@ -34,7 +34,7 @@ from abbe.service.web.units import INCH, METRIC
 from tests.pages_world import Served, as_user
 from tests.service.web.pages.test_rehearsal import PLANS, TOLD
 from tests.service.web.pages.test_result_screens import observed, runs_of
-from tests.service.web.pages.test_screens import HEAVIEST, SVG, loaded
+from tests.service.web.pages.test_screens import SVG
 
 UIN, IN = 0.0254, 25.4
 """µm of a µin, mm of an inch."""
@@ -239,9 +239,3 @@ def test_a_live_run_gives_its_script_the_unit() -> None:
     assert re.findall(r"</span> (µ\w+)", page) == ["µin", "µin"]
     assert "µm" not in page
     assert "±{n} {unit}" in words["live.share_here"]
-
-
-def test_inches_make_no_screen_too_heavy(running: Served) -> None:
-    page = got(running, f"/volume?id={running.filled.solution}")
-    with as_user(running, "vera") as client:
-        assert loaded(client, page) + len(SVG.sub("", page).encode()) < HEAVIEST
