@@ -27,9 +27,9 @@ COPIED = ("abbe", "service", "drivers", "models", "simulators", "tests", "pyproj
 TEST_S, RUN_S = 400, 3600
 HEAD = """# Mistakes that the tests have to notice
 
-Each mistake is put into a copy of the source. A test of the file named here has to fail with it, and passes without it; which test and
-which line, says `tests/experiments/campaigns/source_mutants.py`. CI runs those marked *, all at once. The push protocol has mutants of its
-own ([develop](../how-to/develop.md)).
+Each mistake is put into a copy of the source. A test of the file named here must fail with it and pass without it;
+`tests/experiments/campaigns/source_mutants.py` names the test and the line. CI runs those marked *, all at once. The push protocol has
+mutants of its own ([develop](../how-to/develop.md)).
 
     python -m tests.experiments.campaigns.mutants --page docs/explanation/mutants.md      # half an hour, two cores; writes this page
 
