@@ -65,7 +65,7 @@ class OneBankTables:
             if before == (state, store):
                 break
         else:
-            raise DeviceFault("one table", "read table", f"it changed during each of {TRIES} reads")
+            raise DeviceFault("one table", "read table", f"the table changed during each of {TRIES} reads")
         image = image_in(store)
         mine = BankState.OFF if not state.acts else BankState.SEALED if image else BankState.WRITING
         crc = zlib.crc32(image) if mine is BankState.SEALED else 0

@@ -101,7 +101,7 @@ def plan(words: list[int]) -> Plan:
 
 def _parse(words: list[int]) -> _Table:
     if len(words) < HEADER_WORDS:
-        raise ImageError("shorter than its header")
+        raise ImageError("the image is shorter than its header")
     magic, layout, kind, length, _, lsb, spare, *rest = _HEADER.unpack(data_of(words[:HEADER_WORDS]))
     counts, spare_too, start, step = tuple(rest[:3]), rest[3], tuple(rest[4:7]), tuple(rest[7:])
     if (magic, layout, lsb, spare, spare_too) != (0xABBE, 1, LSB_NM, 0, 0):

@@ -199,9 +199,9 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 
 
 def _field(solution: JointSolution) -> tuple[list[int], F2]:
-    """Return the deviation over the volume per unit of every smooth coefficient and of the six rigid motions, shape (3 x points, q + 6).
+    """Return the indices of the q smooth coefficients, and the deviation over the volume per unit of each and of the six rigid motions.
 
-    Also which coefficients these are. The rough parts are left out: no angle can replace them.
+    The deviation has shape (3 x points, q + 6). The rough parts are left out: no angle can replace them.
     """
     smooth = [i for i, t in enumerate(solution.terms) if t.order <= SMOOTH_ORDER]
     terms = tuple(solution.terms[i] for i in smooth)

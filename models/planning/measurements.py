@@ -112,7 +112,7 @@ class Instruments:
         if not all(0 < v < float("inf") for v in sizes) or not 0 <= self.floor_mm < float("inf"):
             raise ValueError("instruments: lengths, noise, uncertainties and feed must be positive numbers")
         if not self.bar_lengths_mm and not self.laser:
-            raise ValueError("instruments: neither a ball-bar nor a laser")
+            raise ValueError("instruments: there is neither a ball-bar nor a laser")
 
 
 @dataclass(frozen=True, slots=True)

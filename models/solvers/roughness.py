@@ -134,7 +134,7 @@ class _Search:
 
     @classmethod
     def of(cls, solution: JointSolution) -> _Search:
-        """Fit the solution's unknowns again, in units of their prior, with the readings that a period made outliers."""
+        """Fit the solution's unknowns again, in units of their prior, with the readings that looked like outliers because of a period."""
         root_weight = np.sqrt(np.concatenate(_weights(solution)))
         own = np.concatenate([run_design(solution.machine, solution.terms, r, solution.setup) for r in solution.data])
         columns = root_weight[:, None] * (own @ solution.prior_root)

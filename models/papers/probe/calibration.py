@@ -50,7 +50,7 @@ def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROU
     pole = np.abs(angles[:, 0]) <= tolerance_rad
     if int(pole.sum()) != 1 or values.size < 2:
         raise ValueError(
-            f"lobing map: it takes circles and exactly one touch at the pole; {int(pole.sum())} of {values.size} touches are at the pole"
+            f"lobing map: expected circles and exactly one touch at the pole; {int(pole.sum())} of {values.size} touches are at the pole"
         )
     circle, row = _levels("colatitude", angles[~pole, 0], tolerance_rad)
     # The same distance on the sphere is a larger difference in longitude, the most on the smallest circle.
@@ -97,7 +97,7 @@ def _check_complete(circle: F1, longitude: F1, row: Indices, column: Indices) ->
         i, k = (int(n) for n in np.argwhere(count != 1)[0])
         place = f"colatitude {np.rad2deg(circle[i]):.6g}, longitude {np.rad2deg(longitude[k]):.6g} degrees"
         raise ValueError(
-            f"lobing map: it takes circles with the same longitudes; {circle.size} circles and {longitude.size} longitudes were found, "
+            f"lobing map: expected circles with the same longitudes; {circle.size} circles and {longitude.size} longitudes were found, "
             f"with {count[i, k]} touches at {place}"
         )
 

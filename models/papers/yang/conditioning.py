@@ -254,7 +254,8 @@ def spread(a: F2) -> Spread:
 
 
 def common_scale_trace_mm(a: F2, radius_mm: float) -> float:
-    """Return the largest reading by a common scale error of 1 and a bar length error of minus the radius: 0 but for rounding.
+    """Return the largest reading that a common scale error of 1 and a bar length error of minus the radius cause together: 0 except for
+    rounding.
 
     One ball-bar cannot separate the two. ``a``: the ten columns of `design_eq9`.
     """
