@@ -257,6 +257,20 @@ class Calibration(ConfigTable):
         default="", max_length=400, description="maker, model and serial of the ball-bar; number and laboratory of its certificate"
     )
     laser_is: str = Field(default="", max_length=400, description="the same for the laser")
+    artefact: Certificate = Field(
+        default=None, description="of the probed artefact's length; without a calibrated length, of the touch probe's test (ISO 230-10)"
+    )
+    artefact_is: str = Field(default="", max_length=400, description="the same for the artefact")
+
+    def until(self) -> dict[str, date]:
+        """Last days of the certificates that are stated, by instrument (`abbe.service.domain.run.Run.instrument`)."""
+        days = {"ballbar": self.ballbar, "laser": self.laser, "artefact": self.artefact}
+        return {kind: day for kind, day in days.items() if day is not None}
+
+    def identities(self) -> dict[str, str]:
+        """What is stated of each instrument and its certificate."""
+        known = {"ballbar": self.ballbar_is, "laser": self.laser_is, "artefact": self.artefact_is}
+        return {kind: text for kind, text in known.items() if text}
 
 
 class Nc(ConfigTable):

@@ -52,6 +52,7 @@ VERIFY = """
 body_diagonal_um = 20.0
 helix_rms_um = 5.0
 """
+CERTIFIED = ("ballbar", "laser", "artefact")
 LIMITS = """
 [limits]
 table_value_um = {value:g}
@@ -77,7 +78,7 @@ def machine_text(
     urls : DeviceUrls
         Addresses; a device without one gets a comment instead.
     certificates : dict, optional
-        Last day of the certificate of ``ballbar`` and ``laser``; an instrument without one gets a comment instead.
+        Last day of the certificate of ``ballbar``, ``laser`` and ``artefact``; an instrument without one gets a comment instead.
     limits : PushLimits, optional
         Limits of a table; only those that differ from the defaults are written.
     verify : bool
@@ -92,7 +93,7 @@ def machine_text(
         stroke_mm=_rows(doc["stroke_mm"]),
         pivots=PIVOTS.format(rows=_rows(doc["pivots_mm"])) if doc.get("pivots_mm") else "",
         devices="\n".join(_device(role, getattr(urls, role)) for role in ("cnc", "ballbar", "laser", "fixture")),
-        calibration="\n".join(f"{role} = {known[role]}" if role in known else f"# {role} = 2027-05-31" for role in ("ballbar", "laser")),
+        calibration="\n".join(f"{role} = {known[role]}" if role in known else f"# {role} = 2027-05-31" for role in CERTIFIED),
         limits="" if limits is None else _limits(limits),
         verify=VERIFY if verify else "",
     )

@@ -22,7 +22,7 @@ from abbe.service.sequences.nc.write import NcSettings
 class Site:
     """Facts about a machine that a job needs. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
-    ``calibrated_until``: last day of the certificate of ``ballbar`` and of ``laser``; an instrument without a certificate is absent.
+    ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``; one without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
     stated temperature of the scales by axis. ``control``: identity of the control (`control_of`); empty without a control.
     """
@@ -94,7 +94,7 @@ def site_of(config: MachineFile) -> Site:
         CaptureSettings(config.store.capture, int(config.store.capture_reserve_mib * MIB), config.store.keep_segments),
         Watching(limits.run_temperature_c, Suspending(frozenset(limits.continue_after), limits.suspend_s, limits.settle_s)),
         NcSettings(config.nc.acceleration_mm_s2, config.nc.heidenhain_tool, {str(name): kib for name, kib in config.nc.memory_kib.items()}),
-        {kind: day for kind, day in (("ballbar", config.calibration.ballbar), ("laser", config.calibration.laser)) if day is not None},
+        config.calibration.until(),
         limits.two_people,
         config.material.by_axis(),
     )

@@ -84,8 +84,7 @@ def from_store(store: Store, name: str) -> Campaign:
     """
     record = store.campaigns.find(name)
     runs = [load_run(store, r.id) for r in store.runs.all(record.id) if r.visible_status == "complete"]
-    known = record.doc.get("imported") or record.doc
-    doc = known | {"campaign": record.name, "machine": store.machines.get(record.machine_id).doc}
+    doc = record.known | {"campaign": record.name, "machine": store.machines.get(record.machine_id).doc}
     return _campaign(record.name, doc, runs, None)
 
 

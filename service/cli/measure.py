@@ -167,8 +167,8 @@ def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
     needed = needed_by(plan, air=site.watching.air_c is not None)
     if dry or site.urls.cnc is None:
         check_configured(needed, site.urls.named())
-    today = SystemClock().utc().date()
-    for line in (*certificates(site, today, needed.first), *unattended(loaded.machine, site, loaded.path.resolve().parent)):
+    today, probed = SystemClock().utc().date(), {"artefact"} if any(test.artefact for test in plan.tests) else set()
+    for line in (*certificates(site, today, {*needed.first, *probed}), *unattended(loaded.machine, site, loaded.path.resolve().parent)):
         typer.echo(f"warning: {line}", err=True)
 
 

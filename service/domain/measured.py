@@ -375,6 +375,11 @@ class CampaignRecord(DocumentRow):
         """The document, parsed. Raises Unusable if a field has another type."""
         return record(CampaignHead, self.doc, f"campaign {self.name}")
 
+    @property
+    def known(self) -> Doc:
+        """What is known of machine, instruments and artefacts: of an imported campaign the document that was imported."""
+        return self.doc.get("imported") or self.doc
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunFacts:

@@ -288,11 +288,16 @@ def rules_of(config: MachineFile | None) -> Rules:
     if config is None:
         return Rules()
     limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
-    days = {"ballbar": config.calibration.ballbar, "laser": config.calibration.laser}
-    known = {k: v for k, v in (("ballbar", config.calibration.ballbar_is), ("laser", config.calibration.laser_is)) if v}
-    valid = {k: v for k, v in days.items() if v is not None}
     materials = config.material.by_axis()
-    return Rules(limits, valid, config.limits.temperature_c, materials, known, config.issuer, config.item)
+    return Rules(
+        limits,
+        config.calibration.until(),
+        config.limits.temperature_c,
+        materials,
+        config.calibration.identities(),
+        config.issuer,
+        config.item,
+    )
 
 
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:

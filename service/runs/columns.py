@@ -128,16 +128,18 @@ IMPORTED_CHANNEL = "columns"
 
 
 def load_run(store: Store, id_or_label: int | str) -> Run:
-    """Read a run with its pieces from the store; an incomplete one has a ``state`` (`abbe.service.runs.coverage`).
+    """Read a run with its pieces and its artefact from the store; an incomplete one has a ``state`` (`abbe.service.runs.coverage`).
 
     Raises
     ------
     StoreError
         The run is missing, damaged, or too incomplete.
     MeasurementFault
-        Its samples contradict its path.
+        Its samples contradict its path, or its campaign does not describe its artefact.
     """
-    return whole_run(store, store.runs.find(id_or_label))
+    record = store.runs.find(id_or_label)
+    run = whole_run(store, record)
+    return run.with_artefact(store.campaigns.find(record.campaign_id).known) if run.is_artefact else run
 
 
 def whole_run(store: Store, record: RunRecord) -> Run:

@@ -29,6 +29,7 @@ from abbe.service.errors import (
     ProbeUncalibrated,
     Stopped,
 )
+from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.steps import CampaignPlan, TouchFeature
 from abbe.service.storage.store import Store
@@ -88,6 +89,8 @@ async def test_every_feature_is_found_to_a_micrometre_and_the_first_one_again(pl
     await run(place, plan())
     assert found(store) == ALL
     (run_,) = from_store(store, "plate").runs
+    alone = load_run(store, store.runs.all()[0].id)
+    assert alone.setup.features == run_.setup.features == ROW, "a run read alone, as a push reads it, knows its artefact"
     body = b.sim.world.table.body
     form = body.form_mm[[body.ids.index(name) for name in ALL]][:, :2]
     deviation = np.column_stack([run_.columns.further[f"deviation_{a}_mm"] for a in "xy"])

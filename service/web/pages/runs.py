@@ -111,8 +111,7 @@ def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[Run, Do
     machine: dict[str, Any] = store.machines.get(owner.machine_id).doc
     run = with_earliest_mounting([load_run(store, record.id)])[0]
     site = Site(str(machine.get("name") or record.campaign), machine_from_doc(machine), machine, DeviceUrls())
-    known = owner.doc.get("imported") or owner.doc
-    return run, run_report(Measured(Campaign(record.campaign, site, [run], None, known)), record.label, rules)
+    return run, run_report(Measured(Campaign(record.campaign, site, [run], None, owner.known)), record.label, rules)
 
 
 LETTERS = "ABCD"

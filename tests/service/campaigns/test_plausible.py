@@ -65,6 +65,7 @@ CANNOT_BE_KEPT = [
 ]
 RARE = [
     ("ballbar = 2027-05-31", "ballbar = 2020-05-31", "the certificate of the ball-bar ended on 2020-05-31"),
+    ("laser = 2027-05-31", "laser = 2027-05-31\nartefact = 2020-05-31", "the certificate of the artefact ended on 2020-05-31"),
     ("laser = 2027-05-31", "laser = 2072-05-31", "the certificate of the laser ends in 2072: is the year right?"),
     ("laser = 2027-05-31", "", "the laser has no certificate"),
     ("temperature_c = [18, 24]", "temperature_c = [0, 24]", "limits.temperature_c is 0 to 24 degrees C: is that intended?"),
