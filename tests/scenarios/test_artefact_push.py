@@ -11,6 +11,7 @@ import json
 import os
 from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 import pytest
@@ -23,11 +24,13 @@ from abbe.service.compensation.proposal_doc import load
 from abbe.service.config import load_machine
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.runs.columns import load_run
+from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.site import site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import tables_from_image
+from tests.faults.sequencer_world import PATIENT
 from tests.pretended import as_if_commissioned_at
 from tests.scenarios.conftest import Sims, simulated
 
@@ -93,6 +96,14 @@ def recipe(name: str, poses, plate: ArtefactObject) -> str:
         for k, (at, turn) in enumerate(poses, start=1)
     ]
     return recipe_text(name, tuple(tests))
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patient() -> Iterator[None]:
+    """A simulated controller that waits for a core is not silent."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("abbe.service.site.Watching", partial(Watching, unknown_s=PATIENT.unknown_s))
+        yield
 
 
 @pytest.fixture(scope="module")
