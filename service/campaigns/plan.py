@@ -116,7 +116,8 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
 
 BOUND_NOTE = (
     "U is the posterior (Bayesian Cramer-Rao) bound for these readings over the inner 80 % of the volume, without rigid motion, with the "
-    "temperature of the scales; it leaves out error motions above the plan's order, and that noise and typical sizes are only estimated; "
+    "temperature of the scales; it leaves out error motions above the plan's order, and the uncertainty of the estimated noise and typical "
+    "sizes; "
     "`abbe solve` includes both, so its U may be larger; on a machine better than the priors its U is smaller"
 )
 
@@ -220,8 +221,8 @@ def temperature_note(plan: MeasuringPlan) -> str:
 def judge_note(plan: MeasuringPlan) -> str:
     """Describe the holdout run and its cost."""
     if plan.judge is None:
-        return "no run only judges: the minutes are too few for one, so `abbe discover` can prove no name"
-    return f"{plan.judge.label} is not fitted: it judges what is found, for {plan.judge.minutes:.1f} minutes"
+        return "no run is kept out of the fit to judge: the minutes are too few for one, so `abbe discover` can prove no name"
+    return f"{plan.judge.label} is not fitted: it judges what is found, and takes {plan.judge.minutes:.1f} minutes"
 
 
 def goal_lines(plan: MeasuringPlan) -> list[str]:

@@ -178,7 +178,7 @@ def print_json(value: Any) -> None:
 
 
 NUMBER = re.compile(r"[-+−±≤≥~<>\d.,:;%/×x() \n]*")
-"""A cell of nothing but numbers: it is never broken."""
+"""Matches a cell that holds only numbers; such a cell is never broken."""
 NARROWEST = 8
 """Least width of a column of words on a narrow terminal."""
 

@@ -28,7 +28,8 @@ def list_files(as_json: JsonOption = False) -> None:
 
 @device.command("show")
 def show_file(
-    name: Annotated[str, typer.Argument(metavar="NAME", help="As `abbe device list` names it.")], as_json: JsonOption = False
+    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the device file, as `abbe device list` shows it.")],
+    as_json: JsonOption = False,
 ) -> None:
     """Print a device file, to copy and change it: `abbe device show dial-gauge --out my-gauge.toml`."""
     from abbe.drivers.device_file import find, load
@@ -64,10 +65,12 @@ def interferometer(
 @device.command("test")
 def try_device(
     url: Annotated[str, typer.Argument(metavar="URL", help="Address of the device as in [devices], with device=FILE if one describes it.")],
-    role: Annotated[str, typer.Option(help="Of a device with a driver: laser, ballbar or cnc.")] = "laser",
+    role: Annotated[str, typer.Option(help="Role of a device that has its own driver: laser, ballbar or cnc.")] = "laser",
     move: Annotated[float, typer.Option(metavar="MM", help="Known motion, mm, that a person makes when asked; 0: none.")] = 0.0,
-    tolerance: Annotated[float, typer.Option(metavar="MM", help="How exactly that motion is known, mm.")] = 0.05,
-    faults: Annotated[bool, typer.Option("--faults/--no-faults", help="Play late, doubled, spoilt and missing replies.")] = True,
+    tolerance: Annotated[float, typer.Option(metavar="MM", help="Largest error of that motion, mm.")] = 0.05,
+    faults: Annotated[
+        bool, typer.Option("--faults/--no-faults", help="Also simulate late, doubled, corrupted and missing replies.")
+    ] = True,
     out: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Keep the report; tested=FILE.json in the URL uses it.")] = None,
     as_json: JsonOption = False,
 ) -> None:

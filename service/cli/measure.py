@@ -61,7 +61,7 @@ def measure(  # noqa: PLR0913 - one argument for each option
     path: Annotated[bool, typer.Option("--path", help="With --dry-run: every commanded position, as CSV.")] = False,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.html", help="With --dry-run: a page with the paths in three views.")] = None,
     nc: Annotated[str, typer.Option(help="Write an NC program to --out: siemens, fanuc, heidenhain, linuxcnc or iso.")] = "",
-    out: Annotated[Path | None, typer.Option(metavar="FILE", help="Where the NC program, or without --nc the answer goes.")] = None,
+    out: Annotated[Path | None, typer.Option(metavar="FILE", help="File for the NC program; without --nc, for the answer.")] = None,
     resume: Annotated[str, typer.Option(help="Resume this interrupted campaign; its recipe is in the store.")] = "",
     untouched: Annotated[bool, typer.Option("--untouched", help="With --resume: the mounted instruments were not touched.")] = False,
     accept_table: AcceptTable = False,

@@ -303,9 +303,9 @@ def _change_where_touched(solved: Solved) -> tuple[NineTables, Predicted, tuple[
 
     boxes = touched_boxes_mm(joint)
     change, predicted = partial_tables(joint.machine, boxes, known, GRID)
-    where = "part of the strokes where the artefact lay only, assumed elsewhere"
+    where = "part of the strokes where the artefact lay, and assumed elsewhere"
     planes = f"plane{'s' if len(boxes) > 1 else ''} and " if unsensed_axis(joint) is not None else ""
-    return change, predicted, (f"known in the {planes}{where}; {frame[0]}",)
+    return change, predicted, (f"known only in the {planes}{where}; {frame[0]}",)
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:

@@ -33,7 +33,9 @@ from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls the table back before anything else"
-UNTRUSTED_CONTROL = "move nothing; activate the old table at the control, and commission the control again: it does not do what it answers"
+UNTRUSTED_CONTROL = (
+    "move nothing; activate the old table at the control, and commission the control again: what it does differs from its answers"
+)
 MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
 RECHECK_S = 2.0

@@ -44,7 +44,7 @@ class ArtefactFinding:
             if (found := [s.field for s in self.shares if s.verdict in words] + list(self.waves if where.startswith("stays") else ()))
         ]
         if self.scatter > LEFT:
-            said.append(f"unknown, neither: points scatter {self.scatter:.1f} times their repeatability")
+            said.append(f"explained by neither part nor machine: points scatter {self.scatter:.1f} times their repeatability")
         return "; ".join(said) or "none"
 
 

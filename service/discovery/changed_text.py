@@ -72,14 +72,15 @@ def _proof(changed: ChangedSince) -> list[str]:
     if _shows(gap):
         share = gap.closed or 0.0
         goes, part = ("shrinks", f" ({share:.0%} closed)") if share > 0.0 else ("goes", "")
-        out = [f"  on runs that did not choose the change the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"]
+        gap_text = f"the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"
+        out = [f"  on runs that were not used to find the change, {gap_text}"]
     else:
         out = [
             f"  the fitted set-ups absorb nearly all of the change: "
             f"the gap is {before} µm rms without and {after} with it where {floor} µm is noise"
         ]
     if judged < NEAR:
-        out.append("  runs that did not choose the change are not more likely with it")
+        out.append("  the change does not make runs likelier that were not used to find it")
     unconfirmed = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
     if unconfirmed:
         out.append(f"  not chosen by each half of the runs alone: {', '.join(unconfirmed)}")

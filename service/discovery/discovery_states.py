@@ -29,8 +29,8 @@ CLOSED = 0.5
 SOME = 0.2
 """A smaller share of the gap also closes by chance."""
 LEFT = 1.5
-"""Unproved effects explain a gap only if they leave less than this multiple of the noise. Less of a gap than this may also be the
-prediction's own error, so what remains of it refutes no effect with which the holdout runs agree better."""
+"""Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller gap may also be the prediction's own
+error, so it does not refute an effect with which the holdout runs agree better."""
 WORSE = 1.05
 """Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0

@@ -91,7 +91,7 @@ def _proof_text(judged: Judgement) -> str:
 
 
 def _judging_text(gap: GapUm) -> str:
-    """Figures of runs that were never fitted; only of these a closed share is said, because fitted runs flatter."""
+    """Figures of runs that were never fitted. Only these state the closed share of the gap: a fit reduces the residuals of fitted runs."""
     before, after, floor = _gap_values(gap)
     share = "" if gap.closed is None else f" ({max(gap.closed, 0.0):.0%} closed)"
     return f"from {before} to {after} µm rms where {floor} µm is noise{share}"

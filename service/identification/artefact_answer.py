@@ -19,9 +19,9 @@ SENSED = 1e-3
 """An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
 COVERAGE = 2.0
 ONE_PLANE_MM = 5.0
-"""Points lie in one plane if their heights follow each other by no more."""
+"""Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""
 WHOLE_TO, NOTHING_FROM = 0.35, 1.0
-"""Mean squared uncertainty over mean squared deviation up to which a map is offered whole, and from which not at all."""
+"""Ratios of mean squared uncertainty to mean squared deviation: up to the first a map is offered whole, from the second not at all."""
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
 NO_LENGTH = "; no length is calibrated: the scale is not observable"
 NOT_SENSED = "; the third direction was not sensed"

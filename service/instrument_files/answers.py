@@ -88,7 +88,7 @@ def open_questions(content: Content, answers: Answers) -> list[Question]:
     if (content.trace is not None or not content.unit_known) and answers.unit is None:
         out.append(Question("unit", "the unit of the readings", tuple(LENGTHS)))
     if content.test is not None and not content.test.sign_known and answers.sign is None:
-        out.append(Question("sign", "what the values are: how far the axis went too far, or what corrects that", tuple(SIGNS)))
+        out.append(Question("sign", "what the values are: the deviation (+: the axis went too far), or the correction of it", tuple(SIGNS)))
     if content.trace is not None and answers.at_mm is None:
         out.append(Question("at_mm", "where the axis stood, mm (a trace of a moving axis does not say where each sample was taken)"))
     return out

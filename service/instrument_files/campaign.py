@@ -24,9 +24,9 @@ NEAREST_MM = 0.1
 """Least distance of two targets: evaluations round positions to 0.05 mm."""
 ASSUMED_CHAIN = "w-b-X-Y-Z-t"
 PAUSE_S = 60.0
-"""Between the tests of two files on the campaign's clock, if their times are unknown."""
+"""Time between the tests of two files on the campaign's clock, s, if their times are unknown."""
 MOST_SAMPLES = 100_000
-"""A longer trace is averaged in blocks."""
+"""Largest number of values from a trace; a longer one is averaged in blocks."""
 
 
 @dataclass(frozen=True, slots=True)

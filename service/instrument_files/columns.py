@@ -24,7 +24,7 @@ from abbe.service.instrument_files.content import AxisReadings, Content, axis_of
 
 TIMES = {"s": 1.0, "ms": 1e-3, "min": 60.0, "h": 3600.0}
 TEMPERATURES = {"C": 0.0, "K": -273.15}
-"""Units of temperature: what is added to reach °C."""
+"""Units of temperature, and the offset that converts each to °C."""
 PRESSURES = {"Pa": 1.0, "hPa": 100.0, "mbar": 100.0, "kPa": 1000.0}
 POSSIBLE_PA = (60_000.0, 110_000.0)
 MOST_ROWS = 200_000

@@ -16,7 +16,7 @@ from abbe.service.instrument_files.content import Content, Trace, axis_of, diges
 HEAD, DATA, END = b"HEADER::\r\n", b"Data:\r\n", b"EOF::\r\n"
 SAMPLE = np.dtype("<f8")
 MOST = 1e9
-"""Samples, and samples a second: more than any file has."""
+"""Largest accepted number of samples, and of samples per second: more than any file has."""
 
 
 def read_rtx(name: str, data: bytes) -> Content:

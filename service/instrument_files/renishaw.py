@@ -23,7 +23,7 @@ ONE_WAY, BOTH_WAYS = ("0", "1", "2", "0"), ("0", "0", "2", "0")
 """First four words of ``Flags``."""
 LARGEST_MRAD = 100.0
 MOST = 20_000
-"""Targets, and runs: more than any test has."""
+"""Largest accepted number of targets, and of runs: more than any test has."""
 _SECTION = re.compile(r"([A-Z][A-Z -]*)::")
 _NEEDED = ("HEADER", "TARGET DATA", "RUNS", "DEVIATIONS", "EOF")
 _READ = (*_NEEDED, "USER-TEXT", "EQUIPMENT", "ENVIRONMENT")

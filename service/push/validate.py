@@ -273,8 +273,8 @@ def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Itera
         beyond = max((max(low - grid[0], grid[-1] - high) / travel for grid in grids), default=0.0)
         if not beyond <= limits.beyond:
             yield (
-                f"REACH: the runs moved {axis} from {low:.0f} to {high:.0f} mm, the table corrects {beyond:.0%} of the stroke beyond, "
-                f"allowed are {limits.beyond:.0%} ([limits] table_beyond_percent)"
+                f"REACH: the runs moved {axis} from {low:.0f} to {high:.0f} mm, but the table corrects {beyond:.0%} of the stroke beyond "
+                f"that, allowed are {limits.beyond:.0%} ([limits] table_beyond_percent)"
             )
 
 

@@ -124,7 +124,7 @@ WORDS = (
 )  # fmt: skip
 """Words of the templates."""
 NAMES = frozenset(("Machine", "Campaign", "Run", "File", "Authorised by", "Approved by"))
-"""Facts and columns whose values are names: they are never translated. The facts of a certificate are told where they are made."""
+"""Facts and columns whose values are names: they are never translated. The facts of a certificate are translated where they are made."""
 
 
 def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
@@ -158,7 +158,7 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
 
 
 def _told(lang: str, value: Any, key: str = "", head: Any = None) -> Any:
-    """Texts in a language; pictures tell theirs when they are drawn. ``head``: of a table with these rows."""
+    """Texts translated into a language, except those of pictures, which are translated when drawn. ``head``: of a table with these rows."""
     if lang == ENGLISH or key in {"kind", "sign", "layout", "lang", "format", "svgs", "number"}:
         return value
     if key == "facts":

@@ -56,7 +56,7 @@ def touch_columns(records: Sequence[TouchRecord], start: RunStart, pose: Artefac
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
     ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches
-    divided by the root of their number, and the way between two looks of the control at the probe, an error that repeated touches share.
+    divided by the root of their number, and the travel between two readings of the probe input, an error that repeated touches share.
     A ball's height comes from one side and the radius, so it is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
     found = [found_feature(record) for record in records]

@@ -1,4 +1,4 @@
-"""Copy a SQLite database while others write it, prove the copy, and find the processes that have a database open."""
+"""Copy a SQLite database while others write it, check the copy, and find the processes that have a database open."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def _reader(path: Path) -> sqlite3.Connection:
 
 
 def prove_copy(path: Path) -> str:
-    """Prove that a copied database is whole; return its schema revision. The file is only read.
+    """Check that a copied database is undamaged and complete; return its schema revision. The file is only read.
 
     Raises
     ------

@@ -26,7 +26,7 @@ OF_WORK = (
     AlarmKind.PUSHED,
 )
 PRIORITIES: tuple[frozenset[str], ...] = (frozenset({"limit"}), frozenset({"jump"}))
-"""Kinds of signals of the first and the second priority; the third has any other."""
+"""Kinds of signals that have the first and the second priority; every other kind has the third."""
 TRIES = 2
 """Failures of a step, or unfinished campaigns, after which a person takes over."""
 NO_ALARM = 0

@@ -85,7 +85,7 @@ def test_the_story_is_seen_and_approved_in_the_page(demo: Process, page: Page, t
     expect(page.locator("main")).to_contain_text("alarm 1")
     page.goto(f"{base}discovery")
     expect(page.locator("main")).to_contain_text("scale of X")
-    expect(page.locator("main")).to_contain_text("on runs that did not choose the change the gap shrinks from")
+    expect(page.locator("main")).to_contain_text("on runs that were not used to find the change, the gap shrinks from")
     page.goto(base)
     expect(alarm).to_contain_text("scale of X", timeout=LOOKS_MS)
     page.get_by_role("link", name="Proposal 1").first.click()

@@ -28,16 +28,24 @@ def init(  # noqa: PLR0913 - one option for each question
     file: Annotated[Path, typer.Argument(metavar="FILE", help="New machine file.")] = Path(DEFAULT_MACHINE),
     name: Annotated[str | None, typer.Option("--name", help="Name of the machine.", show_default=False)] = None,
     chain: Annotated[str | None, typer.Option("--chain", help="Carriages from workpiece to tool: w-X-Y-b-Z-t.", show_default=False)] = None,
-    strokes: Annotated[str | None, typer.Option("--strokes", help="Of X, Y and Z, mm: 0..600,0..500,0..450.", show_default=False)] = None,
+    strokes: Annotated[
+        str | None, typer.Option("--strokes", help="Strokes of X, Y and Z, mm: 0..600,0..500,0..450.", show_default=False)
+    ] = None,
     tool: Annotated[
-        str | None, typer.Option("--tool", help="From the spindle's reference point to the ball, mm: 0,0,-120.", show_default=False)
+        str | None, typer.Option("--tool", help="Vector from the spindle's reference point to the ball, mm: 0,0,-120.", show_default=False)
     ] = None,
     cnc: Annotated[str | None, typer.Option("--cnc", metavar="URL", help="Address of the controller; none: -.", show_default=False)] = None,
-    ballbar: Annotated[str | None, typer.Option("--ballbar", metavar="URL", help="Of the ball-bar; none: -.", show_default=False)] = None,
-    laser: Annotated[str | None, typer.Option("--laser", metavar="URL", help="Of the laser; none: -.", show_default=False)] = None,
+    ballbar: Annotated[
+        str | None, typer.Option("--ballbar", metavar="URL", help="Address of the ball-bar; none: -.", show_default=False)
+    ] = None,
+    laser: Annotated[str | None, typer.Option("--laser", metavar="URL", help="Address of the laser; none: -.", show_default=False)] = None,
     certificates: Annotated[
         str | None,
-        typer.Option("--certificates", help="Last days, of ball-bar and laser: 2027-05-31,2027-05-31; none: -.", show_default=False),
+        typer.Option(
+            "--certificates",
+            help="Last days of the certificates of ball-bar and laser: 2027-05-31,2027-05-31; none: -.",
+            show_default=False,
+        ),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

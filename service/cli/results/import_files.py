@@ -41,20 +41,23 @@ def import_files(  # noqa: PLR0913 - one argument for each option
         str | None, typer.Option("--name", help="Name of the campaign. Default: that of the first file.", show_default=False)
     ] = None,
     columns: Annotated[
-        Path | None, typer.Option("--columns", metavar="FILE", help="What the columns of a table are (TOML).", show_default=False)
+        Path | None, typer.Option("--columns", metavar="FILE", help="Description of a table's columns (TOML).", show_default=False)
     ] = None,
     axis: Annotated[str | None, typer.Option("--axis", help="X, Y or Z, for a file that does not say it.", show_default=False)] = None,
-    unit: Annotated[str | None, typer.Option("--unit", help="Of the readings, for such a file: mm, um ...", show_default=False)] = None,
+    unit: Annotated[
+        str | None, typer.Option("--unit", help="Unit of the readings, for a file that does not say it: mm, um ...", show_default=False)
+    ] = None,
     sign: Annotated[
-        str | None, typer.Option("--sign", help="measured-nominal or nominal-measured, for such a file.", show_default=False)
+        str | None,
+        typer.Option("--sign", help="measured-nominal or nominal-measured, for a file that does not say it.", show_default=False),
     ] = None,
     at_mm: Annotated[float | None, typer.Option("--at", help="Where the axis stood during a trace, mm.", show_default=False)] = None,
     scale_c: Annotated[
-        float | None, typer.Option("--scale-temperature", help="Of the measured axis' scale, degrees C.", show_default=False)
+        float | None, typer.Option("--scale-temperature", help="Temperature of the measured axis' scale, degrees C.", show_default=False)
     ] = None,
-    air_c: Annotated[float | None, typer.Option("--air-temperature", help="Degrees C.", show_default=False)] = None,
-    pressure_hpa: Annotated[float | None, typer.Option("--air-pressure", help="hPa.", show_default=False)] = None,
-    feed_mm_min: Annotated[float | None, typer.Option("--feed", help="Between the targets, mm/min.", show_default=False)] = None,
+    air_c: Annotated[float | None, typer.Option("--air-temperature", help="Air temperature, degrees C.", show_default=False)] = None,
+    pressure_hpa: Annotated[float | None, typer.Option("--air-pressure", help="Air pressure, hPa.", show_default=False)] = None,
+    feed_mm_min: Annotated[float | None, typer.Option("--feed", help="Feed between the targets, mm/min.", show_default=False)] = None,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,

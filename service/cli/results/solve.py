@@ -78,7 +78,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", metavar="FILE", help="Where the points of --at, or without them the answer go.", show_default=False),
+        typer.Option("--out", metavar="FILE", help="File for the points of --at; without --at, for the answer.", show_default=False),
     ] = None,
     nodes: Annotated[int, typer.Option("--nodes", min=2, max=33, help="Nodes of the grid on each axis.")] = 9,
     unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,

@@ -133,7 +133,7 @@ def test_an_axis_that_grows_is_named_and_proved_by_runs_that_did_not_choose_it(s
     gap = found.gap
     assert gap is not None
     assert gap.after_um < gap.floor_um + 0.1 * (gap.before_um - gap.floor_um)
-    assert any("on runs that did not choose the change the gap shrinks from" in line for line in changed_lines(found))
+    assert any("on runs that were not used to find the change, the gap shrinks from" in line for line in changed_lines(found))
 
 
 def test_without_a_change_what_could_hide_is_told(store: Store, tmp_path: Path) -> None:
@@ -291,7 +291,12 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
         ({}, {"halves": 1}, False, "not chosen by each half of the runs alone: scale of X"),
         ({"gap": GAP | {"after_um": 8.0}}, {}, False, "more than noise is left"),
         ({"gap": GAP | {"before_um": 1.02}}, {}, True, "the fitted set-ups absorb nearly all of the change"),
-        ({"gap": GAP | {"before_um": 1.02}, "judged": -1.0}, {}, False, "runs that did not choose the change are not more likely with it"),
+        (
+            {"gap": GAP | {"before_um": 1.02}, "judged": -1.0},
+            {},
+            False,
+            "the change does not make runs likelier that were not used to find it",
+        ),
         ({"gap": None, "judged": None}, {"halves": 0}, False, "too few set-ups"),
         ({}, {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}, False, "cannot tell it from squareness of X and Y"),
         ({}, {"u": 7.0}, False, "zero is within its uncertainty"),

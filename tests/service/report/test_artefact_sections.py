@@ -41,7 +41,7 @@ def test_each_height_has_its_picture_beside_the_poses(solved: Solved) -> None:
 def test_tables_of_two_heights_take_out_what_both_have(solved: Solved) -> None:
     assert [box[2].tolist() for box in touched_boxes_mm(solved.joint)] == [[200.0, 200.0], [300.0, 300.0]]
     change, promised, (text,) = change_of(solved)
-    assert text.startswith("known in the planes and part of the strokes")
+    assert text.startswith("known only in the planes and part of the strokes")
     x, y = np.meshgrid(np.linspace(280.0, 520.0, 7), np.linspace(120.0, 360.0, 7))
     at = np.column_stack([x.ravel(), y.ravel(), np.full(49, 250.0)])
     left = error_mm(*at[:, :2].T) + change.correction_at(at)[:, :2]
