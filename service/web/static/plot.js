@@ -1,41 +1,16 @@
 // Curves to work with: zoom, cursor with value and U, export. uPlot draws them; where it was not fetched the pictures beside them stay.
 // A figure's series comes in `data-plot` of its box; texts in `data-words` of the list of boxes.
 
+import { inside, line, markOf, paint, within } from "./pen.js";
+
 const { uPlot } = globalThis;
 const VERDICTS = ["pass", "cannot tell", "fail"];
 const SHOWN = 6;
-
-function paint() {
-  const style = getComputedStyle(document.documentElement);
-  const of = (name) => style.getPropertyValue(name).trim();
-  return { line: of("--line"), text: of("--text"), quiet: of("--quiet"), accent: of("--accent"), fail: of("--fail"), pass: of("--pass"), unclear: of("--unclear") };
-}
 
 const number = (value) => (value === null || value === undefined ? "–" : Number(value.toPrecision(SHOWN)).toString());
 
 function fill(text, values) {
   return text.replace(/\{(\w+)\}/g, (_, name) => values[name] ?? "");
-}
-
-function line(pen, points, colour, { dash = [], width = 1 } = {}) {
-  pen.save();
-  pen.strokeStyle = colour;
-  pen.lineWidth = width * devicePixelRatio;
-  pen.setLineDash(dash.map((one) => one * devicePixelRatio));
-  pen.beginPath();
-  points.forEach(([x, y], k) => (k ? pen.lineTo(x, y) : pen.moveTo(x, y)));
-  pen.stroke();
-  pen.restore();
-}
-
-function inside(u, draw) {
-  const { ctx: pen, bbox } = u;
-  pen.save();
-  pen.beginPath();
-  pen.rect(bbox.left, bbox.top, bbox.width, bbox.height);
-  pen.clip();
-  draw(pen, (x) => u.valToPos(x, "x", true), (y) => u.valToPos(y, "y", true), bbox);
-  pen.restore();
 }
 
 // ---- one plot: its frame, hand and keyboard -------------------------------------------------------------------------------------
@@ -71,7 +46,7 @@ export class Plot {
 
   show(min, max) {
     const [first, last] = this.whole;
-    const span = Math.min(Math.max(max - min, (last - first) * 1e-4), last - first);
+    const span = Math.min(Math.max(max - min, this.least ?? (last - first) * 1e-4), last - first);
     const low = Math.min(Math.max(min, first), last - span);
     this.plot.setScale("x", { min: low, max: low + span });
   }
@@ -309,6 +284,8 @@ class Trend extends Box {
   build() {
     const { told, words } = this;
     const colours = paint();
+    const own = [colours.pass, colours.unclear, colours.fail];
+    this.marks = [own, own.map(() => colours.faint)].map((list) => list.map((colour, k) => markOf(VERDICTS[k], colour)));
     const date = zoned(told.zone);
     const days = (u, splits) => splits.map((at) => {
       const [min, max] = [u.scales.x.min, u.scales.x.max];
@@ -332,12 +309,12 @@ class Trend extends Box {
     this.main = new Plot(main, {
       scales, tzDate: date, padding: [12, 12, 0, 0],
       axes: axes(days, colours, `${told.name} [${told.unit}]`),
-      series: [{}, { show: true, stroke: "transparent", points: { show: false } }, { stroke: colours.fail, dash: [6, 4], points: { show: false }, spanGaps: true }],
+      series: [{}, { paths: () => null, points: { show: false } }],
       hooks: { drawAxes: [(u) => this.behind(u, colours)], draw: [(u) => this.points(u, colours)], setScale: [(u, key) => key === "x" && this.follow(u)] },
-    }, [[ends[0], ...told.x, ends[1]], padded(told.y), [limits[0] ?? null, ...told.limit, limits.at(-1) ?? null]], 300, (at) => this.tell(at === null ? null : at - 1));
+    }, [[ends[0], ...told.x, ends[1]], padded(told.y)], 300, (at) => this.tell(at === null ? null : at - 1));
     const { chart } = told;
     const of = (list, by) => list.map((one, k) => (one === null ? null : one / by(k)));
-    const curve = (stroke, dash) => ({ stroke, dash, width: 1.5, spanGaps: true, points: { show: false } });
+    const curve = (stroke, dash) => ({ stroke, dash, width: 1, spanGaps: true, points: { show: false } });
     this.chart = new Plot(below, {
       scales: { x: scales.x, y: { range: (_, min, max) => [Math.min(-1.15, min ?? 0), Math.max(1.15, max ?? 0)] } },
       tzDate: date, padding: [6, 12, 0, 0],
@@ -347,6 +324,8 @@ class Trend extends Box {
         for (const one of [1, -1]) line(pen, [[b.left, y(one)], [b.left + b.width, y(one)]], colours.fail, { dash: [6, 4] });
       })] },
     }, [[ends[0], ...told.x, ends[1]], padded(of(chart.high, () => chart.h)), padded(of(chart.low, () => -chart.h)), padded(of(chart.ewma, (k) => chart.ewma_limit[k]))], 150, (at) => this.tell(at === null ? null : at - 1));
+    // Closer than a few checks there is nothing to be seen.
+    this.main.least = 4 * Math.max(Math.min(...told.x.slice(1).map((at, k) => at - told.x[k])), 60);
     this.main.show(...ends);
   }
 
@@ -368,7 +347,14 @@ class Trend extends Box {
         for (const [cx, cy] of [[at, value], [low, limit], [high, limit]]) pen.lineTo(x(cx), y(cy));
         pen.fill();
         pen.globalAlpha = 1;
-        line(pen, [[x(at), y(value)], [x(days), y(limit)]], colours.accent, { dash: [8, 4], width: 1.5 });
+        line(pen, within([x(at), y(value)], [x(days), y(limit)], b), colours.accent, { dash: [8, 4], width: 1.5 });
+      }
+      const [from, to] = [u.scales.x.min, u.scales.x.max];
+      for (const [k, [ax, level, bx, next]] of told.limits.entries()) {
+        if (k && ax > to || bx < from && k < told.limits.length - 1) continue;
+        const first = k ? x(ax) : Math.min(x(ax), b.left);
+        const last = k < told.limits.length - 1 ? x(bx) : Math.max(x(bx), b.left + b.width);
+        line(pen, within([first, y(level)], [last, y(next)], b), colours.fail, { dash: [6, 4] });
       }
       pen.font = `${12 * devicePixelRatio}px system-ui, sans-serif`;
       pen.textAlign = "center";
@@ -381,49 +367,25 @@ class Trend extends Box {
     });
   }
 
+  // Rectangles and pictures of the marks: a browser without a GPU takes ten times as long for arcs and strokes of a year of points.
   points(u, colours) {
     const { told } = this;
     const r = devicePixelRatio;
     const { min, max } = u.scales.x;
-    inside(u, (pen, x, y) => {
-      // One path for all points that look alike: strokes one by one would be too slow for the points of years.
-      const looks = new Map();
-      const of = (word, earlier) => {
-        const name = `${word} ${earlier}`;
-        if (!looks.has(name)) looks.set(name, { word, earlier, bars: new Path2D(), marks: new Path2D() });
-        return looks.get(name);
-      };
-      told.x.forEach((at, k) => {
-        if (at < min || at > max) return;
-        const { word, bars, marks } = of(VERDICTS[told.verdict[k]], k < told.earlier);
-        const [px, py] = [x(at), y(told.y[k])];
-        if (told.u[k]) {
-          const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
-          for (const [ax, ay, bx, by] of [[0, top, 0, bottom], [-4 * r, top, 4 * r, top], [-4 * r, bottom, 4 * r, bottom]]) {
-            bars.moveTo(px + ax, ay);
-            bars.lineTo(px + bx, by);
-          }
-        }
-        if (word === "pass") {
-          marks.moveTo(px + 4 * r, py);
-          marks.arc(px, py, 4 * r, 0, 2 * Math.PI);
-        } else {
-          const corners = word === "fail" ? [[-5, -5], [5, 5], null, [-5, 5], [5, -5]] : [[0, -5], [5, 0], [0, 5], [-5, 0], [0, -5]];
-          corners.forEach((one, c) => one && marks[c === 0 || !corners[c - 1] ? "moveTo" : "lineTo"](px + one[0] * r, py + one[1] * r));
-        }
-      });
-      for (const { word, earlier, bars, marks } of looks.values()) {
-        const colour = earlier ? colours.quiet : word === "pass" ? colours.pass : word === "fail" ? colours.fail : colours.unclear;
-        pen.globalAlpha = earlier ? 0.5 : 1;
-        pen.strokeStyle = colours.quiet;
-        pen.lineWidth = 1.2 * r;
-        pen.stroke(bars);
-        pen.strokeStyle = pen.fillStyle = colour;
-        pen.lineWidth = 2.5 * r;
-        if (word === "fail") pen.stroke(marks);
-        else pen.fill(marks);
+    inside(u, (pen, x, y, b) => {
+      const seen = [...told.x.keys()].filter((k) => told.x[k] >= min && told.x[k] <= max).map((k) => [k, Math.round(x(told.x[k])), y(told.y[k])]);
+      const caps = seen.length * 8 * r < b.width;
+      for (const [k, px] of seen) {
+        if (!told.u[k]) continue;
+        const [top, bottom] = [y(told.y[k] + told.u[k]), y(told.y[k] - told.u[k])];
+        pen.fillStyle = k < told.earlier ? colours.faint : colours.quiet;
+        pen.fillRect(px - 0.6 * r, top, 1.2 * r, bottom - top);
+        for (const at of caps ? [top, bottom] : []) pen.fillRect(px - 4 * r, at - 0.6 * r, 8 * r, 1.2 * r);
       }
-      pen.globalAlpha = 1;
+      for (const [k, px, py] of seen) {
+        const mark = this.marks[k < told.earlier ? 1 : 0][told.verdict[k]];
+        pen.drawImage(mark, px - mark.width / 2, Math.round(py) - mark.height / 2);
+      }
     });
   }
 
@@ -463,7 +425,14 @@ function opened(told) {
   const [y, u] = texts.map((list) => list.map((text) => Number(text.replace("−", "-")) || 0));
   const limit = told.x.map((_, k) => told.limit.findLast(([from]) => from <= k)[1]);
   const begins = told.x[told.chart.high.findIndex((one) => one !== null)];
-  return { ...told, y, u, limit, begins, shown: texts[0].map((text, k) => [text, texts[1][k]]) };
+  return { ...told, y, u, limit, limits: parts(told.x, limit), begins, shown: texts[0].map((text, k) => [text, texts[1][k]]) };
+}
+
+// A line of levels as its straight parts: from where and which, to where and which.
+function parts(x, levels) {
+  const known = [...x.keys()].filter((k) => levels[k] !== null && !(levels[k] === levels[k - 1] && levels[k] === levels[k + 1]));
+  if (known.length === 1) return [[x[known[0]], levels[known[0]], x[known[0]], levels[known[0]]]];
+  return known.slice(0, -1).map((k, n) => [x[k], levels[k], x[known[n + 1]], levels[known[n + 1]]]);
 }
 
 // Times in s since 1970 as dates that are shifted to a zone. One formatter for all: uPlot's own makes one for each tick of each frame.
