@@ -144,7 +144,7 @@ def _feed_of_path(run: Run) -> list[CampaignIssue]:
     driven = float(np.median(60.0 * np.linalg.norm(np.diff(run.columns.q_mm, axis=0), axis=1) / took))
     if driven <= 0.0 or abs(driven / feed - 1.0) <= OTHER_FEED:
         return []
-    what = f"feed_mm_min says {feed:.0f}, its positions and times say {driven:.0f} mm/min, which is used"
+    what = f"feed_mm_min states {feed:.0f}, but its positions and times give {driven:.0f} mm/min, which is used"
     return [CampaignIssue(run.run_id, what, "correct the column, or exchange it with that of the right run", False)]
 
 

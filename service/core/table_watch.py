@@ -147,7 +147,7 @@ class TableWatch:
         here = f"bank {in_force.bank} has CRC {in_force.crc:08X}"
         whose = f"that of {in_force.unverified}, which was never verified" if in_force.unverified else ""
         if wanted is not None and in_force.crc != wanted:
-            text = f"the compensation in force was changed from outside: {here}, expected is {wanted:08X}"
+            text = f"the compensation in force was changed from outside: {here} instead of {wanted:08X}"
             return f"{text}; it is {whose}" if whose else text
         if whose:
             return f"the compensation in force is unverified: {here}, {whose}"

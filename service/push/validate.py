@@ -250,7 +250,7 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     if not low <= e.temperature_c[0] <= e.temperature_c[1] <= high:
         yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, allowed are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:
-        yield f"RUNS: {e.run_count}, needed are {limits.runs}"
+        yield f"RUNS: {e.run_count}, but {limits.runs} are needed"
     if drift := drift_reason(e.drift_mm, limits):
         yield drift
     if promise := promise_reason(e.before_mm, e.after_mm, e.u_mm, limits):

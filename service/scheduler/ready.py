@@ -86,7 +86,7 @@ class Ready:
         if needs.operator == "absent" and staffed:
             return "an operator is there at this hour"
         if needs.warm_min and (minutes := self.active_min()) < needs.warm_min:
-            return f"the machine is not warm: it was seen at work for {minutes:.0f} of the last 60 min, needed are {needs.warm_min:g}"
+            return f"the machine is not warm: it was seen at work for {minutes:.0f} of the last 60 min, but {needs.warm_min:g} are needed"
         if not (needs.idle or needs.air or needs.operator == "absent"):
             return ""
         try:

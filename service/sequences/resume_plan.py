@@ -393,7 +393,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
 
 
 def _from_centre(test: TestPlan) -> tuple[Step, ...]:
-    """Return the steps of a test whose bar is hung in anew at the centre: over the pole instead of from the end of the previous test."""
+    """Return the steps of a test whose bar is mounted anew at the centre: over the pole, not from the end of the previous test."""
     first = next(k for k, step in enumerate(test.steps) if isinstance(step, RecordPath | ReadBar))
     near = [s for s in test.steps[:first] if isinstance(s, MoveTo)][-2:]  # beside the path's start, and that start
     start = near[-1]

@@ -251,7 +251,7 @@ def _circle(out: Evaluated, group: str, test: CircleTest) -> None:
     sub = _sense(test)
     rows: list[tuple[str, str, float, float | None]] = [
         (f"G_{sub}", f"circular deviation, run {test.run}", one.G_mm, np.sqrt(2.0) * u),
-        (f"G_{sub} (zone)", f"the same by the minimum zone, run {test.run}", one.G_zone_mm, np.sqrt(2.0) * u),
+        (f"G_{sub} (zone)", f"circular deviation by the minimum zone, run {test.run}", one.G_zone_mm, np.sqrt(2.0) * u),
         (f"F_{sub},max", f"radial deviation about the set-up's centre, largest, run {test.run}", one.F_max_mm, u_f),
         (f"F_{sub},min", f"radial deviation about the set-up's centre, smallest, run {test.run}", one.F_min_mm, u_f),
         (f"F_{sub},max (LSC)", f"about the least squares centre, largest, run {test.run}", one.F_max_centred_mm, u_f),

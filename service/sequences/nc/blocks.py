@@ -134,7 +134,7 @@ def program(machine_name: str, plan: CampaignPlan, stroke_mm: Any, arcs: tuple[s
 
 
 def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Yield the blocks of a test. The cup is placed at the centre; the bar does not fit there, so it is hung in beside the path's start."""
+    """Yield the blocks of a test. The cup is placed at the centre; the bar does not fit there, so it is mounted beside the path's start."""
     here: Point | None = None
     steps = test.steps
     first = next((k for k, s in enumerate(steps) if isinstance(s, RecordPath | ReadBar)), 0)
@@ -145,7 +145,7 @@ def _test(test: TestPlan, arcs: tuple[str, ...]) -> Iterator[Block]:
         if isinstance(step, ZeroLaser) and k and isinstance(steps[k - 1], MountLaser):
             continue  # one halt for both: the listener would take a program start between them for the measurement
         if mount is not None and k == hang:
-            yield Halt(f"hang in the bar of {test.bar.radius_mm:g} mm")
+            yield Halt(f"mount the bar of {test.bar.radius_mm:g} mm")
         if mount is not None and mount < k < hang and isinstance(step, MoveTo | FollowPath):
             step = replace(step, feed_mm_min=min(step.feed_mm_min, feed))
         yield from _step(test, step, here, arcs)
@@ -187,7 +187,7 @@ def _by_hand(step: Step) -> str:
         case TakeBarOut():
             return "take the bar out, leave the cup"
         case ChangeBar(radius):
-            return f"hang in the bar of {radius:g} mm"
+            return f"mount the bar of {radius:g} mm"
         case MountLaser(beam):
             along = " ".join(f"{a}{v:+.4f}" for a, v in zip(AXES, beam, strict=True))
             return f"set up laser and mirror, beam along {along}; zero the laser"

@@ -97,7 +97,7 @@ def file_table(recipe: TestRecipe) -> dict[str, Any]:
 Array = NDArray[np.float64]
 RAPID_MM_MIN = 6000.0
 BAR_APPROACH_MM = 0.5
-"""Length of the approach with the bar hung in: far more than any lost motion, and within the bar's stroke of 1 mm either way."""
+"""Length of the approach with the bar mounted: far more than any lost motion, and within the bar's stroke of 1 mm either way."""
 LINK_CHORD_MM = 2.0
 """Chord length of the way on the sphere between two paths: at a radius of 50 mm a chord runs 10 um inside the sphere."""
 SAME_PLACE_MM = 0.01

@@ -191,7 +191,7 @@ def test_columns_that_contradict_the_positions_are_flagged_by_name():
         run["columns"][key] = [factor * v for v in run["columns"][key]]
     feed, direction = column_issues(runs_of(good))
     driven = good[0]["columns"]["feed_mm_min"][0]
-    assert feed.line.startswith(f"run c: feed_mm_min says {4 * driven:.0f}, its positions and times say {driven:.0f} mm/min")
+    assert feed.line.startswith(f"run c: feed_mm_min states {4 * driven:.0f}, but its positions and times give {driven:.0f} mm/min")
     assert direction.line.startswith("run b: its column direction contradicts the sense of rotation of its positions")
     assert not feed.refuse
     assert not direction.refuse

@@ -60,7 +60,7 @@ async def test_a_strange_table_is_told_once_and_shown_until_it_is_gone() -> None
         await bench.then(STRANGE, 100.0)
         (alarm,) = bench.shelf.alarms
         assert alarm["code"] == CODE
-        assert "bank 1 has CRC 0000000B, expected is 0000000A" in alarm["what"]
+        assert "bank 1 has CRC 0000000B instead of 0000000A" in alarm["what"]
         assert len(bench.attention) == 2
         assert "accept-table" in bench.attention[1]
         await bench.then(replace(STRANGE, wanted=0xB), 2 * LOOK_S)  # a person has accepted it
@@ -104,7 +104,7 @@ async def test_without_a_push_a_control_as_it_comes_is_what_counts() -> None:
         assert (bench.shelf.alarms, bench.attention) == ([], ["another line"])
         for strange in (0xB, 0xC):
             await bench.then(InForce(1, strange, None, strange=True), 100.0)
-            assert f"{strange:08X}, expected is 0000000A" in bench.attention[-1]
+            assert f"{strange:08X} instead of 0000000A" in bench.attention[-1]
             assert bench.attention[1:] == [f"{CODE}: {bench.shelf.alarms[-1]['what']} - {REMEDY}"]
         assert [alarm["remedy"] for alarm in bench.shelf.alarms] == [REMEDY] * 2
         await bench.then(InForce(0, 0xA, None), 100.0)
@@ -123,7 +123,7 @@ async def test_without_a_push_a_control_as_it_comes_is_what_counts() -> None:
         (InForce(1, 0xC, 0xC, unverified="push 2 of machine 'mill'"), "unverified: bank 1 has CRC 0000000C, that of push 2"),
         (
             InForce(1, 0xC, 0xA, unverified="push 2 of machine 'mill'"),
-            "expected is 0000000A; it is that of push 2 of",
+            "instead of 0000000A; it is that of push 2 of",
         ),
     ],
 )
