@@ -25,7 +25,7 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
     each, means = made.readings_per_value, made.how == "means"
     became = f"every {each} of them were averaged" if means else f"one of every {each} was used, unaveraged"
     done = f"{made.readings} ball-bar readings are too many to search one by one: {became}, {made.kept} values in all"
-    hidden = f"effects that this hides may be present all the same: {'; '.join(made.unobservable)}"
+    hidden = f"effects hidden by this reduction may still be present: {'; '.join(made.unobservable)}"
     return (done, hidden, REMEDY) if means else (done, hidden)
 
 

@@ -25,8 +25,8 @@ def nothing_missing(finding: Finding) -> str:
     if off:
         runs = _few([f"{a.run} {a.times:.2g} times" for a in off])
         text += (
-            f"; runs that were never fitted deviate by more than noise and the prediction's own uncertainty allow: {runs} as much "
-            f"(chance gives as much in a share of {off[0].p:.1g} of such campaigns)"
+            f"; runs that were never fitted deviate by more than noise and the uncertainty of the prediction allow: {runs} as much "
+            f"(by chance this happens in a share of {off[0].p:.1g} of such campaigns)"
         )
     return text + open_
 

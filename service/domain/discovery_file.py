@@ -91,7 +91,7 @@ class FoundUnseen(FileObject):
 
 
 class FoundThinning(FileObject):
-    """Decimation: long ball-bar runs were searched with fewer values than readings; effects that this hides may be present."""
+    """Decimation: long ball-bar runs were searched with fewer values than readings; effects hidden by this may still be present."""
 
     readings: int
     kept: int

@@ -106,7 +106,7 @@ def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch)
     assert 4 <= told.values_with_reversal <= 8  # X and Y turn round twice a turn each; one of these is where the circle begins
     done, hidden, remedy = lines_of(told)
     assert "every 3 of them were averaged, 80 values in all" in done
-    assert "effects that this hides may be present all the same" in hidden
+    assert "effects hidden by this reduction may still be present" in hidden
     assert f"{told.values_with_reversal} means span a reversal of an axis" in hidden
     assert f"vibration above {told.highest_hz:.2g} Hz" in hidden
     assert "is 1/3 as high" in hidden
@@ -138,7 +138,7 @@ def test_a_thinned_campaign_says_so_in_command_json_and_report(tmp_path: Path, m
     assert len(answer["thinning"]["not_seen"]) == 3
     page = document_html(found_report(job, journal, finding, "now"))
     assert "every 2 of them were averaged" in page
-    assert "effects that this hides may be present all the same" in page
+    assert "effects hidden by this reduction may still be present" in page
 
 
 def test_a_short_campaign_says_nothing_of_it(tmp_path: Path) -> None:

@@ -222,8 +222,8 @@ def changed(search: Search, **changes: Any) -> Any:
             (Agreement("r03", 1.82, 3e-7),),
             (),
             "open",
-            "the fitted runs to their noise; runs that were never fitted deviate by more than noise and the prediction's own uncertainty "
-            "allow: r03 1.8 times as much (chance",
+            "the fitted runs to their noise; runs that were never fitted deviate by more than noise and the uncertainty of the prediction "
+            "allow: r03 1.8 times as much (by chance",
         ),
         ((Agreement("r03", 1.12, 0.03),), (), "ok", "explains all runs to their noise"),
         ((), (Unjudged("r03", "nobody knows"),), "ok", "explains the fitted runs to their noise; not judged, for nobody knows: r03"),
