@@ -256,7 +256,7 @@ class FalseTrips(ProbeFault):
 
 
 class ProbeUncalibrated(ProbeFault):
-    """A feature's radius shows that the stylus is not the stated one, or not qualified."""
+    """A feature's radius shows that the stylus is not the stated one, or no longer as it was qualified."""
 
     code = "PRB-005"
 

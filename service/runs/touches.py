@@ -17,11 +17,15 @@ ROUNDS = 6
 
 @dataclass(frozen=True, slots=True)
 class FoundFeature:
-    """Axis position of the centre (3,), distance of the tip's centre from it at the touches, and spread of a single touch, mm."""
+    """Axis position of the centre (3,), distance of the tip's centre from it at the touches, and spread of a single touch, mm.
+
+    ``u_radius_mm``: standard uncertainty of that distance by repeatability and resolution.
+    """
 
     centre_mm: F1
     radius_mm: float
     spread_mm: float
+    u_radius_mm: float
 
 
 def found_feature(touched: TouchedFeature) -> FoundFeature:
@@ -38,7 +42,9 @@ def found_feature(touched: TouchedFeature) -> FoundFeature:
         centre, radius = centre + step[:-1] @ free, radius + float(step[-1])
     left = np.concatenate([(side - mean) @ way for side, mean, way in zip(each, means, sides, strict=True)])
     degrees = sum(len(side) - 1 for side in each)
-    return FoundFeature(centre, radius, float(np.sqrt(np.sum(left**2) / max(degrees, 1))))
+    spread = float(np.sqrt(np.sum(left**2) / max(degrees, 1)))
+    u_radius = float(np.hypot(spread / np.sqrt(sum(map(len, each))), touched.resolution_mm / np.sqrt(12.0 * len(each))))
+    return FoundFeature(centre, radius, spread, u_radius)
 
 
 def _free(sides: F2) -> F2:

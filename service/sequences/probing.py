@@ -26,6 +26,8 @@ RADIUS_MM = 0.05
 """Allowed difference between measured and expected radius of a feature: it covers pre-travel and a hole's tolerance, not another stylus."""
 MOVED_MM = 0.01
 """Allowed change of a feature that is touched again: it covers minutes of drift, not a plate that has slipped."""
+QUALIFIED_MM, COVERAGE = 0.002, 2.0
+"""Allowed change of the radius that the first feature shows when it is touched again, beyond the uncertainty of both (k = 2): warming."""
 TOUCH_S = 30.0
 RESEAT_S, POLL_S = 1.0, 0.02
 """How long a stylus may take to come back to rest after a touch (receivers report it late), and how often this is asked."""
@@ -223,12 +225,28 @@ class FeatureTouch:
             )
 
 
-def check_unmoved(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> None:
-    """Compare a feature with its first touches in the same pose. Raises SetupDisturbed if it has moved."""
+def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> None:
+    """Compare a feature with its first touches in the same pose: stylus and artefact have to be as they were.
+
+    Raises
+    ------
+    ProbeUncalibrated
+        Its radius has changed by more than `QUALIFIED_MM` and its uncertainty: the qualification of the stylus has drifted.
+    SetupDisturbed
+        It has moved.
+    """
     before = next((one for one in earlier if one.feature == touched.feature), None)
     if before is None:
         return
-    moved = math.dist(found_feature(touched).centre_mm, found_feature(before).centre_mm)
+    then, now = found_feature(before), found_feature(touched)
+    drift, expanded = now.radius_mm - then.radius_mm, COVERAGE * math.hypot(then.u_radius_mm, now.u_radius_mm)
+    if abs(drift) > QUALIFIED_MM + expanded:
+        raise ProbeUncalibrated(
+            f"feature {touched.feature}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um while {len(earlier)} features "
+            "were touched: the stylus is no longer as it was qualified",
+            "tighten or change the stylus, qualify it, and measure this pose from the beginning",
+        )
+    moved = math.dist(now.centre_mm, then.centre_mm)
     if moved > MOVED_MM:
         raise SetupDisturbed(
             f"feature {touched.feature} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: the artefact is loose",

@@ -18,7 +18,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import AT_WORK, PAUSED, Control, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
-from abbe.service.sequences.probing import FeatureTouch, check_unmoved, guarded_move, need_probe
+from abbe.service.sequences.probing import FeatureTouch, check_same, guarded_move, need_probe
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (
     ChangeBar,
@@ -107,7 +107,9 @@ class Runner:
         self._expected = expected
         self._waited_s = 0.0
         self._points = 0
-        self._still = self._stands = False
+        self._still = self._stands = self._paused_here = False
+        self._reference: TouchFeature | None = None
+        """First feature of an artefact's pose: it is touched again to see whether stylus and artefact are as they were."""
         self.touched = False
         """Whether a person may have touched the set-up in the pause that ended the run."""
         self.hand: int | None = None
@@ -175,7 +177,7 @@ class Runner:
         before_mm = (await self._s.controller.status()).position_mm
         watch.tolerated, self._still = PAUSED, True
         touched = await paused(self._s, self._control, self._watching, self._expected, self.journal, beam=watch.beam)
-        watch.tolerated, self._still = NOTHING, False
+        watch.tolerated, self._still, self._paused_here = NOTHING, False, True
         if touched and self._stands:
             self.touched = True
             raise RunInterrupted("the door was open during the pause", "the set-up is checked again before the test resumes")
@@ -267,7 +269,8 @@ class Runner:
 
     async def _same_artefact(self, reference: TouchFeature, carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch) -> Point:
         """Touch the first feature again: only an equal place proves an undisturbed artefact. Then keep the earlier features."""
-        check_unmoved(parsed(TouchRecord, await self._touched(reference, watch)), [parsed(TouchRecord, one) for one in carried])
+        self._reference = reference
+        await self._requalified(watch)
         for one in carried:
             await recorder.add_record(one)
         self._points = len(carried)
@@ -305,7 +308,8 @@ class Runner:
                 await recorder.add_record(await read_bar(self._s.need_ballbar(), step, settled, here))
             case TouchFeature():
                 record = await self._touched(step, watch)
-                check_unmoved(parsed(TouchRecord, record), [parsed(TouchRecord, one) for one in self.records])
+                check_same(parsed(TouchRecord, record), [parsed(TouchRecord, one) for one in self.records])
+                self._reference = self._reference if self.records else step
                 await self._kept(record, recorder)
             case FollowPath():
                 await self._stands_at(step.points_mm[0])
@@ -315,16 +319,26 @@ class Runner:
         return {}
 
     async def _touched(self, step: TouchFeature, watch: Watch) -> dict[str, Any]:
-        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by. After a pause it begins anew."""
+        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by. After a pause it begins anew, and
+        the first feature is touched before it: who paused may have touched stylus or artefact.
+        """
         record = None
         while record is None:
             await self._safe_place(step, watch)
+            paused_here, self._paused_here = self._paused_here, False
+            if paused_here and self.records and self._reference not in (None, step):
+                await self._requalified(watch)
             record = await FeatureTouch(need_probe(self._s.controller), step, lambda: self._control.stopping or self._control.pausing).run()
         status = await self._s.controller.status()
         check_interlocks(status)
         air_c = None if self._s.laser is None else (await self._s.laser.peek()).air_temp_c
         known = {} if air_c is None or math.isnan(air_c) else {"temperature_C": air_c}
         return {"host_s": status.host_s, "ctrl_us": status.ctrl_us, **record, **known}
+
+    async def _requalified(self, watch: Watch) -> None:
+        reference, earlier = self._reference, [parsed(TouchRecord, one) for one in self.records]
+        assert reference is not None
+        check_same(parsed(TouchRecord, await self._touched(reference, watch)), earlier)
 
     async def _stands_at(self, start_mm: Point) -> None:
         """Refuse a path unless the machine stands at its start: from elsewhere the first move may lead through the sphere."""

@@ -324,6 +324,52 @@ async def test_another_stylus_than_stated_is_named(place):
         await run(place, plan(stylus_radius_mm=2.7))
 
 
+def worn(b: Bench, by_mm: float) -> Callable[[], None]:
+    """Let the ball of the stylus become smaller, or move on its stem, by so much."""
+    stylus = b.sim.world.table.stylus
+    return lambda: setattr(stylus, "radius_mm", stylus.radius_mm - by_mm)
+
+
+async def test_a_stylus_that_changes_while_it_measures_is_named_when_the_first_feature_is_touched_again(place):
+    b, store = place
+    made = plan()
+    with pytest.raises(
+        ProbeUncalibrated, match=r"feature A1: its radius changed by \+(19|20)\.\d ± \d\.\d um while 3 features were touched"
+    ):
+        await run(place, made, at(made, 2, worn(b, 0.02)))
+    (failed,) = store.runs.all()
+    assert failed.reason.startswith("PRB-005")
+    with pytest.raises(ProbeUncalibrated, match="while 3 features"):
+        await on(place, made)
+    worn(b, -0.02)()
+    await on(place, made)
+    assert found(store) == ALL, "with the stylus as it was, nothing is lost"
+
+
+async def test_a_stylus_that_stays_within_its_qualification_is_not_doubted(place):
+    b, store = place
+    made = plan()
+    await run(place, made, at(made, 2, worn(b, 0.001)))
+    assert found(store) == ALL
+
+
+async def test_after_a_pause_the_first_feature_is_touched_before_the_next_one(place):
+    b, _ = place
+    made = plan()
+
+    class Changing(AtStep):
+        def __init__(self) -> None:
+            super().__init__(feature_step(made, 2), self.pause)
+
+        async def resumed(self) -> None:
+            worn(b, 0.02)()
+            self.resume()
+            await super().resumed()
+
+    with pytest.raises(ProbeUncalibrated, match=r"feature A1: its radius changed by .* while 2 features were touched"):
+        await run(place, made, Changing())
+
+
 async def test_a_plate_that_lies_elsewhere_is_named_before_anything_breaks(place):
     b, _ = place
     made = plan()
