@@ -146,8 +146,8 @@ def test_tables_with_turned_signs_are_taken_back_and_the_journal_says_why(shop, 
         assert states[-1] == "ROLLED_BACK"
         assert "PROBED" in states
         assert "VERIFIED" not in states
-        assert next(e.doc["why"] for e in entries if e.state == "ROLLBACK") == told["text"]
-        assert [v.verdict for v in store.verifications.all()] == ["fail"]
+        assert next(e.doc["why"] for e in entries if e.state == "ROLLBACK") == f"verify: {told['text']}"
+        assert [v.verdict for v in store.verifications.latest()] == ["fail"]
 
 
 def test_tables_of_a_plate_are_pushed_read_back_and_kept_by_a_pose_that_is_measured_anew(shop, capsys):
@@ -161,13 +161,14 @@ def test_tables_of_a_plate_are_pushed_read_back_and_kept_by_a_pose_that_is_measu
     with Store.open(shop.url) as store:
         wanted = load(store, number).tables
         states = [str(e.state) for e in store.pushes.entries("sim") if e.push == told["push"]]
-        before, after = [load_run(store, r.id) for r in store.runs.all()][-2:]
-        verdict = store.verifications.all()[-1]
+        records = store.runs.all()[-2:]
+        before, after = [load_run(store, r.id) for r in records]
+        verdict = store.verifications.latest(limit=1)[0]
     assert states[-2:] == ["VERIFIED", "KEEP"]
     there = tables_from_image(image)
     for a in range(3):
         assert np.abs(there.correction_mm[a] - wanted.correction_mm[a]).max() < 1e-6, "read back by another connection"
     assert [(r.role, r.setup.artefact, r.table.crc == crc) for r in (before, after)] == [("holdout", "plate", n) for n in (False, True)]
-    assert before.columns.t_s[0] < after.columns.t_s[0]
+    assert str(records[0].ended_utc) < records[1].started_utc
     worst = verdict.doc["figures"]["worst_pose_um"]
     assert (verdict.verdict, 0.0 < worst["u"] < worst["value"] < 3.0) == ("pass", True)
