@@ -24,6 +24,8 @@ from typing import Any
 import pytest
 from hypothesis import settings
 
+from tests.built_once import _commands_built_once, _schema_built_once  # noqa: F401 - fixtures of every test
+
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 settings.register_profile("fixed", derandomize=True, database=None, max_examples=100 if LONG else 40)
 settings.load_profile("fixed")  # a test that fails must fail again: hypothesis draws the same examples in every run

@@ -1,4 +1,4 @@
-"""Here migrations are what is tested: other folders may replace Alembic's upgrade by a copy of what it makes, this one never does."""
+"""Here migrations are what is tested: elsewhere a copy of what they make replaces Alembic's upgrade, in this folder it never does."""
 
 from __future__ import annotations
 

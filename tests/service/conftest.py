@@ -12,7 +12,6 @@ from typing import Any
 import pytest
 
 from abbe.service.storage.store import Store
-from tests.built_once import _commands_built_once, _schema_built_once  # noqa: F401 - fixtures of every test of this folder
 
 NOW = datetime(2026, 11, 21, 3, 34, tzinfo=UTC)
 

@@ -8,7 +8,6 @@ Two machines of each kind; six with ``ABBE_TEST_LONG=1``.
 import os
 
 import numpy as np
-import pytest
 from numpy.polynomial import legendre
 
 from abbe.models.solvers.joint import JointSolution, solve_joint
@@ -69,9 +68,8 @@ def distances(truth: Truth, s: JointSolution) -> tuple[np.ndarray, np.ndarray]:
     return np.array([z[n] for n in seen]), np.array(list(z.values()))
 
 
-@pytest.mark.parametrize("family", [Cubic])
-def test_what_is_stated_as_seen_is_within_its_uncertainty_on_other_machines(family):
-    solved = [distances(t, solve_joint(MACHINE, t.campaign())) for t in map(family, SEEDS)]
+def test_what_is_stated_as_seen_is_within_its_uncertainty_on_a_machine_whose_angles_are_mostly_zero():
+    solved = [distances(t, solve_joint(MACHINE, t.campaign())) for t in map(Cubic, SEEDS)]
     found = share([np.abs(z) < 1.96 for z, _ in solved], [z for z, _ in solved])
     assert found.count > 100 * len(SEEDS) / 6
     assert found.share + 3.0 * found.se > 0.93
@@ -79,11 +77,7 @@ def test_what_is_stated_as_seen_is_within_its_uncertainty_on_other_machines(fami
     assert max(np.abs(z).max() for z, _ in solved) < 6.0
     everything = np.concatenate([z for _, z in solved])
     assert np.mean(np.abs(everything) < 1.96) > 0.93  # also where little but the prior speaks
-
-
-def test_no_motion_of_a_machine_whose_angles_are_mostly_zero_is_far_outside_its_uncertainty():
-    solved = [distances(t, solve_joint(MACHINE, t.campaign())) for t in map(Cubic, SEEDS)]
-    assert max(np.abs(z).max() for _, z in solved) < 6.0
+    assert np.abs(everything).max() < 6.0
 
 
 def test_motions_that_fade_slowly_and_stop_at_once_are_held_as_well():

@@ -8,7 +8,7 @@ import pytest
 from abbe.models.geometry.bases import SMOOTH_ORDER, smooth_terms
 from abbe.models.paths import straight_line
 from abbe.models.solvers.assessment import map_against_prior
-from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.priors import Priors, rough_root, size_model, smooth_shapes
 from abbe.models.solvers.roughness import periods, rough_lines
 from tests.models.solvers.truth import MACHINE, Truth
@@ -57,21 +57,31 @@ def test_the_lead_of_a_screw_is_named_with_its_period_and_the_spacing_of_a_table
     assert "only a table with points every 2.5 mm or less follows it" in rough_lines(solution)[0]
 
 
-@pytest.mark.parametrize("kind", [Truth, Walk])
-def test_no_period_is_claimed_where_there_is_none(kind):
-    assert periods(solve_joint(MACHINE, fine_line(kind(6)))) == ()
+@pytest.fixture(scope="module")
+def smooth() -> JointSolution:
+    return solve_joint(MACHINE, fine_line(Truth(6)))
 
 
-def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_than_no_map():
-    smooth, truth = solve_joint(MACHINE, Truth(7).campaign()), Walk(7)
-    rough = solve_joint(MACHINE, truth.campaign())
+@pytest.fixture(scope="module")
+def rough() -> tuple[Truth, JointSolution]:
+    truth = Walk(6)
+    return truth, solve_joint(MACHINE, fine_line(truth))
+
+
+def test_no_period_is_claimed_where_there_is_none(smooth, rough):
+    assert periods(smooth) == ()
+    assert periods(rough[1]) == ()
+
+
+def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_than_no_map(smooth, rough):
+    truth, found = rough
     assert max(t.order for t in smooth.terms) == SMOOTH_ORDER
     assert rough_lines(smooth) == ()
-    assert max(t.order for t in rough.terms) > SMOOTH_ORDER
-    assert rough_lines(rough)
+    assert max(t.order for t in found.terms) > SMOOTH_ORDER
+    assert rough_lines(found)
     p = np.random.default_rng(1).uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (300, 3))
     rigid = np.column_stack([np.ones(300), p])  # offsets and rotations, and as much of scale and squareness: the same for both
-    left = [d - rigid @ np.linalg.lstsq(rigid, d, rcond=None)[0] for d in (truth.deviation(p), truth.deviation(p) - rough.deviation_mm(p))]
+    left = [d - rigid @ np.linalg.lstsq(rigid, d, rcond=None)[0] for d in (truth.deviation(p), truth.deviation(p) - found.deviation_mm(p))]
     assert np.std(left[1]) < 0.8 * np.std(left[0])
 
 
