@@ -31,22 +31,31 @@ def corrected(run):
     return replace(run, columns=replace(run.columns, further=further))
 
 
-def test_the_figure_is_the_deviation_without_the_rigid_motion(solved_and_last):
-    solved, last = solved_and_last
-    figure = pose_figures([last], solved.joint).worst
+def warmed(run):
+    """The same pose with a temperature of the air on record."""
+    return replace(run, columns=replace(run.columns, further={**run.columns.further, "temperature_C": np.full(len(run.columns), 21.5)}))
+
+
+def true_rms(last):
+    """Deviation of the machine over a pose without the rigid motion, rms."""
     e = error_mm(*last.columns.q_mm[:, :2].T)
     own = e - e.mean(axis=0)
     away = last.columns.q_mm[:, :2] - last.columns.q_mm[:, :2].mean(axis=0)
     turn = np.stack([-away[:, 1], away[:, 0]], axis=1)
     own -= turn * (turn * own).sum() / (turn**2).sum()
-    true = float(np.sqrt(np.mean(own**2)))
+    return float(np.sqrt(np.mean(own**2)))
+
+
+def test_the_figure_is_the_deviation_without_the_rigid_motion(solved_and_last):
+    solved, last = solved_and_last
+    figure, true = pose_figures([last], solved.joint).worst, true_rms(last)
     assert figure.value_mm == pytest.approx(true, abs=3.0 * figure.u_mm)
     assert 0.0 < figure.u_mm < 0.1 * true
 
 
 def test_a_better_machine_is_kept_and_a_worse_one_is_not(solved_and_last):
     solved, last = solved_and_last
-    warm = replace(last, columns=replace(last.columns, further={**last.columns.further, "temperature_C": np.full(len(last.columns), 21.5)}))
+    warm = warmed(last)
     before, after = (pose_figures([run], solved.joint) for run in (warm, corrected(warm)))
     decision = decide(before, after)
     assert decision.keep, decision.text
@@ -72,3 +81,18 @@ def test_a_pose_that_the_solution_used_proves_nothing(solved_and_last):
     )
     with pytest.raises(MeasurementFault, match="repeats a pose of the solution"):
         pose_figures([there], solved.joint)
+
+
+def test_another_artefact_verifies_if_one_pose_of_it_was_solved_with_the_first(tmp_path_factory):
+    one = from_folder(campaign(tmp_path_factory.mktemp("one")))
+    two = from_folder(campaign(tmp_path_factory.mktemp("two"), seed=7))
+    others = [
+        replace(r, run_id=f"q{k}", setup=replace(r.setup, setup_id=f"q{k}", artefact="B")) for k, r in enumerate((two.runs[1], two.runs[3]))
+    ]
+    known, last = others[0], replace(others[1], role="holdout")
+    solved = solve_runs(one.site, [*one.runs[:3], known])
+    figure = pose_figures([last], solved.joint).worst
+    true = true_rms(last)
+    assert figure.value_mm == pytest.approx(true, abs=3.0 * figure.u_mm)
+    assert 0.0 < figure.u_mm < 0.2 * true
+    assert decide(pose_figures([warmed(last)], solved.joint), pose_figures([corrected(warmed(last))], solved.joint)).keep
