@@ -61,8 +61,8 @@ site: $(SITE_READY) ## README and docs/ as a site in build/site, with search, th
 	@OPENBLAS_NUM_THREADS=1 $(SITE_VENV)/bin/python -W ignore -m sphinx -q -W --keep-going -c docs $(ARGS) . build/site
 	@echo "build/site/index.html"
 
-pictures: $(DEV_READY) ## take the pictures of docs/pictures anew, from the screens of the tests and from a demonstration; needs Chromium
-	@ABBE_PICTURES=$(CURDIR)/docs/pictures OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/system/test_pictures.py
+pictures: $(DEV_READY) ## take the pictures of docs/pictures and the layouts of tests/system/layouts anew; needs Chromium
+	@ABBE_PICTURES=$(CURDIR)/docs/pictures OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest tests/system/test_pictures.py tests/system/test_layouts.py
 
 bench: $(BENCH_READY) ## speed and memory of the fast paths against other libraries (own environment, .venv-bench)
 	@ABBE_TEST_REQUIRE=numba,lmfit,GTC,uncertainties,sklearn,statsmodels $(BENCH_VENV)/bin/python -m pytest tests/experiments/kernel/test_kernel.py tests/experiments/test_bench_case.py tests/experiments/test_bench_trials.py tests/experiments/test_bench_discovery.py
