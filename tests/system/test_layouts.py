@@ -30,14 +30,17 @@ SCREENS = {
 }  # fmt: skip
 NEAR_PX = 3
 """Rounding of positions; a button that moves by more is told."""
-FONT = "@font-face {{ font-family: Box; src: url(data:font/ttf;base64,{}) }} * {{ font-family: Box !important; }}"
+FONT = """@font-face {{ font-family: Box; src: url(data:font/ttf;base64,{}) }}
+* {{ font-family: Box !important; text-rendering: geometricPrecision !important; }}"""
+"""Letters stand at fractions of a pixel; hinting by the computer's own settings would round their widths."""
 
 SEEN = """() => {
   const shown = [];
   const walk = (e) => {
     const style = getComputedStyle(e), r = e.getBoundingClientRect();
     if (style.visibility === "hidden" || style.display === "none" || !r.width || !r.height) return;
-    const own = [...e.childNodes].filter(n => n.nodeType === 3).map(n => n.data.trim()).filter(Boolean).join(" ").replace(/[0-9a-f]{16,}/g, "#").replace(/[0-9]/g, "0");
+    const words = [...e.childNodes].filter(n => n.nodeType === 3).map(n => n.data.trim()).filter(Boolean).join(" ");
+    const own = words.replace(/[0-9a-f]{16,}/g, "#").replace(/[0-9]/g, "0");
     const back = style.backgroundColor === "rgba(0, 0, 0, 0)" ? "" : style.backgroundColor;
     if (own || back || e.matches("svg, canvas, input, select, button, a, section"))
       shown.push([e.tagName.toLowerCase(), own.slice(0, 60), Math.round(r.x + scrollX), Math.round(r.y + scrollY), Math.round(r.width),
