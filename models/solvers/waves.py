@@ -1,0 +1,192 @@
+"""Search for periods of screws in points of artefacts: one period or two at once, on one axis or on all.
+
+The data are the displacements at the positions of the axes, with everything else that the solution has integrated out. Every period is
+judged by the evidence of a sine and a cosine beside a scatter from position to position, whose size is integrated out as well. Two periods
+are searched together: while one is looked for alone the other one is scatter, and an alias may fit best, because features stand at
+multiples of a pitch. The result is a probability for every frequency.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.arrays import F1, F2
+from abbe.models.solvers.artefact import PRIORS, Fine
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem
+
+PERIODS_MM = (4.0, 60.0)
+"""Range of the searched periods."""
+LEADS_MM = (5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0)
+USUAL, SMOOTH, ALL_AXES, TWO = 0.7, 0.3, 0.7, 0.3
+"""Prior probabilities: a period is the lead of a usual screw; there is no period; all axes have the same one; a period has a second one
+beside it."""
+LEAST = 0.05
+"""Least probability of a period that enters the model."""
+COARSE, FINE, NEAR = 0.3, 0.06, 2
+"""Steps of the searched frequencies times the length of the positions: of pairs, and of the neighbourhood of the best pairs, with its half
+width in fine steps."""
+APART = 4
+"""Coarse steps between the two periods of a pair, at least: closer ones are one period with a changing amplitude."""
+LIKELY = 60
+"""Number of pairs whose neighbourhood is searched finely."""
+SCATTER_MM = tuple(float(v) for v in np.geomspace(3e-5, 4e-3, 9))
+"""Standard deviations of the scatter from position to position that are tried, equally probable."""
+
+Pair = tuple[NDArray[np.intp], NDArray[np.intp]]
+
+
+@dataclass(frozen=True)
+class Peak:
+    """A probable period of some axes: frequency with standard uncertainty, 1/mm, and probability."""
+
+    axes: tuple[int, ...]
+    frequency: float
+    u_frequency: float
+    weight: float
+
+
+@dataclass(frozen=True)
+class Displacements:
+    """What the readings say of the displacements d at positions of the axes: log likelihood ``h @ d - d @ information @ d / 2``, mm.
+
+    ``axis``, ``at_mm``: axis and position of every displacement, shape (n,).
+    """
+
+    axis: NDArray[np.intp]
+    at_mm: F1
+    h: F1
+    information: F2
+
+    @classmethod
+    def of(cls, problem: CampaignProblem, fit: CampaignFit, places: Sequence[Fine]) -> Displacements:
+        """Of a solution that has these places as unknowns: their posterior without their prior."""
+        at = np.array([problem.names.index(p.name) for p in places])
+        kind = problem.readings.kind
+        weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
+        scale = fit.sizes.typical[at] * fit.components.half(fit.sizes)[at]
+        columns = problem.readings.a[:, at] * (scale / fit.sizes.typical[at])
+        mean = columns.T @ (weight * fit.residual_mm / problem.sigma)  # at the optimum the gradient equals the prior's
+        precision = np.linalg.inv(fit.posterior.cov[np.ix_(at, at)])
+        values, vectors = np.linalg.eigh(precision - np.eye(at.size))
+        known = (vectors * np.maximum(values, 0.0)) @ vectors.T
+        axis, at_mm = np.array([p.axis for p in places]), np.array([p.at_mm for p in places])
+        return cls(axis, at_mm, precision @ mean / scale, known / np.outer(scale, scale))
+
+    @property
+    def span_mm(self) -> float:
+        """Longest way along an axis."""
+        return float(max(np.ptp(self.at_mm[self.axis == a]) for a in set(self.axis.tolist())))
+
+    def waves(self, axes: tuple[int, ...], frequency: F1) -> NDArray[np.float64]:
+        """Displacements by a cosine and a sine of each axis, in units of their prior, shape (frequencies, n, 2 axes)."""
+        turn = 2.0 * np.pi * frequency[:, None] * self.at_mm
+        pair = PRIORS.wave_mm * np.stack([np.cos(turn), np.sin(turn)], axis=-1)
+        return np.concatenate([pair * (self.axis == a)[:, None] for a in axes], axis=-1)
+
+    def beside(self, scatter_mm: float) -> tuple[F1, F2, float]:
+        """The same likelihood with an independent scatter of every displacement integrated out, and its log evidence."""
+        whole = np.eye(self.h.size) + scatter_mm**2 * self.information
+        h, information = np.linalg.solve(whole, self.h), np.linalg.solve(whole, self.information)
+        evidence = 0.5 * scatter_mm**2 * self.h @ h - 0.5 * np.linalg.slogdet(whole)[1]
+        return np.asarray(h), 0.5 * (information + information.T), float(evidence)
+
+
+def peaks(data: Displacements) -> tuple[Peak, ...]:
+    """Return the probable periods."""
+    frequency = np.arange(1.0 / PERIODS_MM[1], 1.0 / PERIODS_MM[0], FINE / data.span_mm)
+    log_prior = np.log(_prior(frequency, data.span_mm))
+    levels = [data.beside(s) for s in SCATTER_MM]
+    out, total, found = list[Peak](), [np.log(SMOOTH) + _mixed([np.array(level[2]) for level in levels])], []
+    alone = np.arange(frequency.size)
+    for axes, belief in _hypotheses(tuple(sorted(set(data.axis.tolist())))):
+        single = log_prior + np.log((1.0 - TWO) * belief) + _evidence(data, levels, axes, (frequency,))
+        one, two = _pairs(data, levels, axes, frequency, log_prior)
+        joint = _evidence(data, levels, axes, (frequency[one], frequency[two]))
+        both = log_prior[one] + log_prior[two] + np.log(2.0 * TWO * belief) + joint
+        total += [np.logaddexp.reduce(single), np.logaddexp.reduce(both)]
+        found.append((axes, np.concatenate([alone, one, two]), np.concatenate([single, both, both])))
+    for axes, at, each in found:
+        weight = np.bincount(at, np.exp(each - np.logaddexp.reduce(total)), minlength=frequency.size)
+        out += _peaks(axes, frequency, np.asarray(weight, dtype=np.float64), data.span_mm)
+    return tuple(out)
+
+
+def _hypotheses(axes: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
+    """Axes that have the same periods, with the prior probability."""
+    if len(axes) == 1:
+        return [(axes, 1.0)]
+    return [(axes, ALL_AXES), *(((a,), (1.0 - ALL_AXES) / len(axes)) for a in axes)]
+
+
+def _mixed(values: list[F1]) -> F1:
+    """Mean of evidences over the sizes of the scatter, as logarithms."""
+    return np.asarray(np.logaddexp.reduce(np.array(values), axis=0) - np.log(len(values)))
+
+
+def _evidence(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequencies: tuple[F1, ...]) -> F1:
+    """Log evidence of these periods at once, shape of one array of frequencies."""
+    waves = np.concatenate([data.waves(axes, f) for f in frequencies], axis=-1)
+    out = []
+    for h, information, base in levels:
+        asked = waves.transpose(0, 2, 1) @ h
+        whole = waves.transpose(0, 2, 1) @ (information @ waves) + np.eye(waves.shape[-1])
+        lower = np.linalg.cholesky(whole)
+        half = np.linalg.solve(lower, asked[..., None])[..., 0]
+        volume = np.log(np.diagonal(lower, axis1=1, axis2=2)).sum(axis=1)
+        out.append(base + 0.5 * np.einsum("fi,fi->f", half, half) - volume)
+    return _mixed(out)
+
+
+def _pairs(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequency: F1, log_prior: F1) -> Pair:
+    """Pairs of frequencies around the best ones of a coarse search that takes the axes for independent, each once."""
+    step = round(COARSE / FINE)
+    coarse = np.arange(0, frequency.size, step)
+    waves = [data.waves((a,), frequency[coarse]) for a in axes]
+    value = _mixed([base + np.sum([_gain_of_pairs(w, h, information) for w in waves], axis=0) for h, information, base in levels[::2]])
+    one, two = np.triu_indices(coarse.size, APART)
+    best = np.argsort(-(value[one, two] + log_prior[coarse[one]] + log_prior[coarse[two]]))[:LIKELY]
+    shift = np.arange(-NEAR, NEAR + 1)
+    near = np.broadcast_arrays(coarse[one[best]][:, None, None] + shift[:, None], coarse[two[best]][:, None, None] + shift)
+    pairs = np.unique(np.clip(np.stack(near, axis=-1).reshape(-1, 2), 0, frequency.size - 1), axis=0)
+    return pairs[:, 0], pairs[:, 1]
+
+
+def _gain_of_pairs(waves: NDArray[np.float64], h: F1, information: F2) -> F2:
+    """Log evidence of every pair of frequencies on one axis beside that of none, shape (frequencies, frequencies); waves (f, n, 2)."""
+    f = len(waves)
+    flat = waves.transpose(1, 0, 2).reshape(h.size, -1)
+    asked, across = (flat.T @ h).reshape(f, 2), (flat.T @ information @ flat).reshape(f, 2, f, 2).transpose(0, 2, 1, 3)
+    own = across[np.arange(f), np.arange(f)] + np.eye(2)
+    first = np.linalg.inv(own)
+    taken = np.swapaxes(across, -1, -2) @ first[:, None]  # (one, two, of two, of one)
+    left = asked[None] - (taken @ asked[:, None, :, None])[..., 0]
+    a, b, d = (own[:, i, j] - (taken[..., i, :] * across[..., :, j]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
+    volume = a * d - b * b
+    u, v = left[..., 0], left[..., 1]
+    alone = 0.5 * np.einsum("fi,fij,fj->f", asked, first, asked) - 0.5 * np.log(np.linalg.det(own))
+    return np.asarray(alone[:, None] + 0.5 * (d * u * u - 2.0 * b * u * v + a * v * v) / volume - 0.5 * np.log(np.maximum(volume, 1e-12)))
+
+
+def _peaks(axes: tuple[int, ...], frequency: F1, weight: F1, span_mm: float) -> list[Peak]:
+    """Probable periods: frequencies with the probability around each of them, within the resolution of the positions."""
+    out: list[Peak] = []
+    while weight.max() > 0.1 * LEAST:
+        near = np.abs(frequency - frequency[np.argmax(weight)]) <= 0.5 / span_mm
+        mine = np.where(near, weight, 0.0)
+        if mine.sum() >= LEAST:
+            mean = float(np.average(frequency, weights=mine))
+            spread = float(np.sqrt(np.average((frequency - mean) ** 2, weights=mine)))
+            out.append(Peak(axes, mean, max(spread, FINE / span_mm / np.sqrt(12.0)), min(float(mine.sum()), 1.0)))
+        weight = np.where(near, 0.0, weight)
+    return out
+
+
+def _prior(frequencies: F1, span_mm: float) -> F1:
+    """Prior probability of every searched frequency: a usual lead, within the resolution of the positions, or any."""
+    near = np.abs(frequencies[:, None] - 1.0 / np.array(LEADS_MM)) < 0.5 / span_mm
+    usual = (near / np.maximum(near.sum(axis=0), 1)).sum(axis=1) / len(LEADS_MM)
+    return np.asarray((1.0 - SMOOTH) * (USUAL * usual + (1.0 - USUAL) / frequencies.size))
