@@ -90,9 +90,9 @@ def _joined(nuggets: tuple[Fine, ...], groups: list[tuple[Fine, ...]]) -> tuple[
 
 
 def _noisy(problem: CampaignProblem, fit: CampaignFit) -> bool:
-    """Whether probed points scatter more than they repeat; a workpiece scatters by its drilling."""
-    probed = any(r.points is not None and r.points.source == "probe" for r in problem.runs)
-    return probed and float(np.exp(0.5 * fit.components.eta[KINDS.index("artefact")])) > NOISY
+    """Whether probed points scatter more than they repeat. A workpiece scatters by its drilling as well, so it always counts as noisy."""
+    sources = {r.points.source for r in problem.runs if r.points is not None}
+    return "cmm" in sources or ("probe" in sources and float(np.exp(0.5 * fit.components.eta[KINDS.index("artefact")])) > NOISY)
 
 
 def _with(runs: tuple[RunData, ...], fine: tuple[Fine, ...]) -> tuple[RunData, ...]:
