@@ -12,12 +12,12 @@ from functools import lru_cache
 import numpy as np
 from numpy.polynomial import legendre
 
-from abbe.models.arrays import F1, F2
+from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.legendre import legendre_values
 from abbe.models.functions.motions import ROTATIONS, motion_names
 from abbe.models.machine import AXES as DIRECTIONS
 
-__all__ = ["DIRECTIONS", "ROTATIONS", "Term", "layout_of", "legendre_values", "motion_names", "smooth_terms", "term_values"]
+__all__ = ["DIRECTIONS", "ROTATIONS", "Term", "layout_of", "legendre_values", "motion_names", "smooth_terms", "term_motions", "term_values"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,6 +91,40 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
     for i, axis, sign in layout.squareness:
         out[i] = sign * travel_mm[axis]
     return np.ascontiguousarray(out.T)
+
+
+def term_motions(terms: tuple[Term, ...], coefficients: F1, axes_mm: F2, stroke_mm: F2) -> F3:
+    """Return the error motions that coefficients of terms give at commanded positions, without lever arms.
+
+    The same as the products of `term_values` with the coefficients, in a tenth of the time: the polynomials are evaluated once per axis.
+
+    Parameters
+    ----------
+    coefficients : array, shape (len(terms),)
+        mm or rad.
+    axes_mm : array, shape (n, 3)
+    stroke_mm : array, shape (3, 2)
+
+    Returns
+    -------
+    array, shape (n, 3 axes X Y Z, 6)
+        EX EY EZ (mm, squareness included, counted from the start of the stroke), EA EB EC (rad).
+    """
+    layout = layout_of(terms)
+    square = [i for i, _, _ in layout.squareness]
+    own = np.delete(np.arange(len(terms)), square)
+    weight = np.zeros((3, layout.highest + 1, 6))
+    (order, axis), component = np.divmod(layout.row[own], 3), layout.motion[own] % 6
+    np.add.at(weight, (axis, order, component), coefficients[own])
+    np.subtract.at(weight, (axis, 0, component), coefficients[own] * layout.at_start[own])
+    start, travel_mm = stroke_mm[:, :1], np.asarray(axes_mm).T - stroke_mm[:, :1]
+    u = np.minimum(np.maximum(2.0 * travel_mm / (stroke_mm[:, 1:] - start) - 1.0, -1.0), 1.0)
+    out: F3 = np.empty((travel_mm.shape[1], 3, 6))
+    for a in range(3):
+        out[:, a] = legendre.legvander(u[a], layout.highest) @ weight[a]
+    for i, a, sign in layout.squareness:
+        out[:, a, terms[i].component] += sign * coefficients[i] * travel_mm[a]
+    return out
 
 
 @dataclass(frozen=True)

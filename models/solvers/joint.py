@@ -17,8 +17,8 @@ from weakref import WeakKeyDictionary
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term, rough_terms, smooth_terms
-from abbe.models.geometry.chain import design
+from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term, rough_terms, smooth_terms, term_motions
+from abbe.models.geometry.field import field_mm
 from abbe.models.machine import Machine, with_tool
 from abbe.models.solvers.components import KINDS, RIGID6, OrderChoice, choose, term_levels, total
 from abbe.models.solvers.engine import (
@@ -140,7 +140,8 @@ class JointSolution:
 
     def deviation_mm(self, axes_mm: F2, tool_mm: F1 | None = None) -> F2:
         """Predicted deviation without lost motion at commanded positions, shape (n, 3), mm; ``tool_mm`` None: the machine's own tool."""
-        return np.asarray(design(with_tool(self.machine, tool_mm), self.terms, axes_mm) @ self.coefficients)
+        terms, coefficients, stroke = self.terms, self.coefficients, self.machine.stroke_mm
+        return field_mm(with_tool(self.machine, tool_mm), lambda at: term_motions(terms, coefficients, at, stroke), axes_mm)
 
     def backlash_mm(self) -> dict[str, tuple[float, float]]:
         """Lost motion of each axis and its standard uncertainty, mm."""

@@ -13,6 +13,7 @@ import numpy as np
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.motions import REVERSE, ErrorMotions
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
+from abbe.models.geometry.field import field_mm, in_blocks
 from abbe.models.geometry.propagation import Points, deviation_covariance
 from abbe.models.machine import AXES, Machine
 from abbe.service.config import load_machine, read_toml
@@ -28,8 +29,6 @@ FORMAT = "abbe-deviations/1"
 CONVENTION = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"
 SLACK_MM = 1e-9
 """Tolerance for rounding at the ends of a stroke."""
-CHUNK = 65_536
-"""Points evaluated at a time."""
 ROWS = 4096
 """Points written at a time."""
 
@@ -120,20 +119,33 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
 
 
 def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact: bool) -> tuple[F2, F2 | None]:
-    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), in chunks, to bound the memory for a million points."""
+    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), in blocks, to bound the memory for a million points."""
     at = Points(points.axes_mm, points.direction, points.tool_mm)
-    count = points.axes_mm.shape[0]
-    off: F2 = np.empty((count, 3))
-    u: F2 | None = None if known.covariance is None else np.empty((count, 4))
-    for start in range(0, count, CHUNK):
-        rows = slice(start, start + CHUNK)
+    u: F2 | None = None if known.covariance is None else np.empty((points.axes_mm.shape[0], 4))
+    off = _deviation(machine, known, at, exact=exact)
+
+    def block(rows: slice) -> None:
+        if u is not None and known.covariance is not None:
+            covariance = deviation_covariance(machine, known.motions, known.covariance, at.rows(rows), exact=exact)
+            u[rows] = standard_uncertainty_mm(off[rows], covariance)
+
+    in_blocks(points.axes_mm.shape[0], block)
+    return off, u
+
+
+def _deviation(machine: Machine, known: KnownErrors, at: Points, *, exact: bool) -> F2:
+    """Deviation, shape (n, 3): as a field where all points have one tool and no direction, else point by point, in blocks."""
+    if not exact and at.direction is None and at.tool_mm is None:
+        return field_mm(machine, known.motions.motions, at.axes_mm)
+    off: F2 = np.empty((at.axes_mm.shape[0], 3))
+
+    def block(rows: slice) -> None:
         some = at.rows(rows)
         values = known.motions.motions(some.axes_mm, some.direction)
         off[rows] = (exact_deviation_mm if exact else deviation_mm)(machine, some.axes_mm, values, some.tool_mm)
-        if u is not None and known.covariance is not None:
-            covariance = deviation_covariance(machine, known.motions, known.covariance, some, exact=exact)
-            u[rows] = standard_uncertainty_mm(off[rows], covariance)
-    return off, u
+
+    in_blocks(at.axes_mm.shape[0], block)
+    return off
 
 
 def read_machine(path: Path) -> tuple[str, Machine, list[str]]:

@@ -9,6 +9,7 @@ from functools import partial
 import numpy as np
 
 from abbe.models.arrays import F2
+from abbe.models.geometry.field import field_mm
 from tests.experiments.bench import peers
 from tests.experiments.bench.case import Case
 from tests.experiments.kernel import fast, kernel
@@ -35,22 +36,13 @@ def _compiled_one(case: Case) -> Run:
     return partial(_path().scattered, case.tables, case.points)
 
 
-def _grid(case: Case) -> Run:
-    return lambda: kernel.grid(case.tables, *case.axes).reshape(-1, 3)
-
-
-def _compiled_grid(case: Case) -> Run:
-    grid = _path().grid
-    return lambda: grid(case.tables, *case.axes, all_cores=True).reshape(-1, 3)
-
-
-def _compiled_grid_one(case: Case) -> Run:
-    grid = _path().grid
-    return lambda: grid(case.tables, *case.axes).reshape(-1, 3)
+def _product(case: Case) -> Run:
+    """What `abbe errors` and every map of a solution call."""
+    return lambda: field_mm(case.tables.machine, case.tables.motions, case.points)
 
 
 def _copy(case: Case) -> Run:
-    """Floor of the scattered points: read 24 MB, write 24 MB, into the same place each time."""
+    """Floor of any points: read 24 MB, write 24 MB, into the same place each time."""
     out = np.zeros_like(case.points)
 
     def run() -> F2:
@@ -92,8 +84,8 @@ def cpu_count() -> int:
 
 
 OURS: dict[str, dict[str, Callable[[Case], Run]]] = {
-    "scattered": {"numpy": _numpy, "compiled": _compiled, "compiled-1": _compiled_one},
-    "grid": {"numpy": _grid, "compiled": _compiled_grid, "compiled-1": _compiled_grid_one},
+    "scattered": {"product": _product, "numpy": _numpy, "compiled": _compiled, "compiled-1": _compiled_one},
+    "grid": {"product": _product},
 }
 PEERS: dict[str, Callable[[Case], Run]] = {"htm": peers.htm, "sympy": peers.sympy, "pytransform3d": peers.pytransform3d}
 EXTRA: dict[str, dict[str, Callable[[Case], Run]]] = {
@@ -105,7 +97,10 @@ EXTRA: dict[str, dict[str, Callable[[Case], Run]]] = {
     "grid": {"htm-small": partial(peers.htm, small_angles=True), "sympy-open": partial(peers.sympy, open_grid=True)},
 }
 """Peers with more help than a user would give them at first; they have no goal."""
-FLOORS: dict[str, dict[str, Callable[[Case], Run]]] = {"scattered": {"copy": _copy, "copy-all": _copy_all}, "grid": {"fill": _fill}}
+FLOORS: dict[str, dict[str, Callable[[Case], Run]]] = {
+    "scattered": {"copy": _copy, "copy-all": _copy_all},
+    "grid": {"copy": _copy, "fill": _fill},
+}
 
 
 def look_up(name: str, case: Case) -> Callable[[], object] | None:

@@ -84,4 +84,6 @@ def lines(found: dict) -> list[str]:
         word = "" if one["right"] else "   NUMBERS DIFFER"
         start = f"{one['start_s']:9.1f}" if "start_s" in one else f"{'-':>9}"
         out.append(f"  {name:<22}{one['wall_s']:9.1f}{start}{first['wall_s'] / one['wall_s']:9.2f}{word}")
+    if not any(name.startswith("Dask") for name in found):
+        out.append("  Dask is not in this environment: .venv/bin/python -m tests.experiments.bench --only reanalysis")
     return [*out, "Start: of processes and libraries, counted in the seconds before it. More workers than cores gain nothing."]

@@ -8,6 +8,9 @@ from tests.experiments.bench.facts import LIBRARIES
 
 GOALS = {"numpy": {"htm": 25, "sympy": 12, "pytransform3d": 12}, "compiled": {"htm": 200, "sympy": 100, "pytransform3d": 100}}
 GOALS["compiled-1"] = GOALS["compiled"]
+GOALS["product"] = {"htm": 1, "sympy": 1, "pytransform3d": 1}
+GRID_FLOORS = 3.0
+"""Times the copy of 24 MB that the product may take for the grid."""
 MEMORY_MB = 200
 CASE_WORDS = {"scattered": "1,000,000 scattered points", "grid": "grid of 100 x 100 x 100 points"}
 WORDS = {
@@ -22,17 +25,18 @@ WORDS = {
     "copy": "floor: copy 24 to 24 MB, 1 core",
     "copy-all": "floor: the same, all cores",
     "fill": "floor: write 24 MB, 1 core",
-    "compiled-1": "ours, compiled, 1 thread",
-    "numpy": "ours, numpy",
+    "compiled-1": "even tables, compiled, 1 thread",
+    "product": "the product",
+    "numpy": "even tables, numpy",
 }
 
-SHORT = {"numpy": "numpy", "compiled": "compiled, all cores", "compiled-1": "compiled, 1 thread"}
+SHORT = {"product": "product", "numpy": "numpy", "compiled": "compiled, all cores", "compiled-1": "compiled, 1 thread"}
 
 
 def text(found: dict) -> str:
     """Everything for people."""
     f = found["facts"]
-    words = {**WORDS, "compiled": f"ours, compiled, {f['threads']} threads"}
+    words = {**WORDS, "compiled": f"even tables, compiled, {f['threads']} threads"}
     busy = "" if f["load"] is None else f", load {f['load']:.1f} at the start"
     lines = [
         "Deviation of a machine with 21 errors, tables of 51 nodes, float64; trials and propagation of uncertainties",
@@ -68,7 +72,7 @@ MAP_NOTES = [
 
 
 def _times(name: str, case: dict, words: dict) -> list[str]:
-    who, floor = case["contestants"], _floor(name, case)
+    who, floor = case["contestants"], _floor(case)
     out = [f"{CASE_WORDS[name]:<39}{'best ms':>9}{'median':>9}{'x floor':>9}{'beyond MB':>11}{'process MB':>12}{'look-up':>9}"]
     for k in [*OURS[name], *PEERS, *EXTRA[name], *FLOORS[name]]:
         w = who[k]
@@ -112,8 +116,9 @@ def _results(case: dict, words: dict) -> list[str]:
     return out
 
 
-def _floor(name: str, case: dict) -> float:
-    return min(case["contestants"][k]["min_s"] for k in FLOORS[name])
+def _floor(case: dict) -> float:
+    """One core that copies the points; all cores together, or writing alone, may be faster."""
+    return float(case["contestants"]["copy"]["min_s"])
 
 
 def _verdict(met: bool) -> str:

@@ -1,9 +1,9 @@
-"""`kernel.scattered` and `kernel.grid` as compiled loops, on one processor core or, when asked for, on all.
+"""`kernel.scattered` as a compiled loop, on one processor core or, when asked for, on all.
 
 The one file that knows numba (extra ``fast``). Without it, importing this file is an ImportError, and `tests.experiments.kernel.fast` takes
 numpy.
 
-On one core there is no state and no thread library: any number of threads may be in these functions at once (Python's lock is free
+On one core there is no state and no thread library: any number of threads may be in this function at once (Python's lock is free
 meanwhile), and a forked process may go on calling them. Sharing a call among the cores needs one of numba's threading layers; what that
 costs in safety is said at ``all_cores`` and in decision 0009.
 
@@ -20,7 +20,7 @@ import numba
 import numpy as np
 from numba import prange
 from numba.core.compiler_lock import global_compiler_lock
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F1, F2
 from tests.experiments.kernel import kernel
@@ -29,8 +29,6 @@ from tests.experiments.kernel.table_machine import Segments, TableMachine
 BLOCK = 4096
 """Points that one core takes at a time."""
 
-COLUMNS = 1500
-"""Numbers of the Y-Z plane that one core takes at a time in a grid: eight rows of them are 96 kB."""
 
 _U = np.uint64
 _FIRST, _SECOND, _THIRD = 32, 24, 16
@@ -70,42 +68,6 @@ def scattered(tables: TableMachine, axes_mm: ArrayLike, out: F2 | None = None, *
     loop = _shared_loop() if all_cores and _shareable() else _compiled
     loop(axes.reshape(-1), *_rows(seg), limits, np.array(seg.order, dtype=np.int64), result.reshape(-1))
     return result
-
-
-def grid(
-    tables: TableMachine,
-    x_mm: ArrayLike,
-    y_mm: ArrayLike,
-    z_mm: ArrayLike,
-    out: NDArray[np.float64] | None = None,
-    *,
-    all_cores: bool = False,
-) -> NDArray[np.float64]:
-    """First-order deviation on a full grid (rule G, math.md 2), as `tests.experiments.kernel.kernel.grid` has it.
-
-    Parameters
-    ----------
-    tables : TableMachine
-        Error motions in mm and rad, ISO 230-1 signs.
-    x_mm, y_mm, z_mm : arrays, shape (nx,), (ny,), (nz,)
-        Commanded positions, neither even nor sorted of need, treated as in `scattered`.
-    out : array, shape (nx, ny, nz, 3), optional
-        Where to write; float64, C order.
-    all_cores : bool
-        As in `scattered`.
-
-    Returns
-    -------
-    array, shape (nx, ny, nz, 3)
-        Actual minus nominal, tool relative to workpiece, in the directions of X, Y, Z, mm; ``out`` if given.
-
-    Raises
-    ------
-    ValueError
-        A shape or the kind of ``out`` is wrong.
-    """
-    product = _shared_product() if all_cores and _shareable() else _compiled_product
-    return kernel.grid(tables, x_mm, y_mm, z_mm, out, product=product)
 
 
 def threads() -> int:
@@ -210,30 +172,6 @@ def _loop_shared(axes: Any, a: Any, b: Any, c: Any, limits: Any, order: Any, out
         _part(axes, (a, b, c), limits, order, block * BLOCK, min(n, (block + 1) * BLOCK), out)
 
 
-def _columns(a: Any, b: Any, out: Any, first: Any, block: Any) -> None:
-    """One block of columns of a matrix product with 8 in between; they stay in the cache for all rows."""
-    start, end = block * COLUMNS, min(b.shape[1], (block + 1) * COLUMNS)
-    b0, b1, b2, b3 = b[0, start:end], b[1, start:end], b[2, start:end], b[3, start:end]
-    b4, b5, b6, b7 = b[4, start:end], b[5, start:end], b[6, start:end], b[7, start:end]
-    for i in range(a.shape[0]):
-        p, q, r, s, t, u, v, w = a[i, 0], a[i, 1], a[i, 2], a[i, 3], a[i, 4], a[i, 5], a[i, 6], a[i, 7]
-        row = out[i, first + start : first + end]
-        for c in range(end - start):
-            row[c] = (p * b0[c] + q * b1[c] + r * b2[c] + s * b3[c]) + (t * b4[c] + u * b5[c] + v * b6[c] + w * b7[c])
-
-
-def _product(a: Any, b: Any, out: Any, first: Any) -> None:
-    """All columns on one core."""
-    for block in range((b.shape[1] + COLUMNS - 1) // COLUMNS):
-        _block(a, b, out, first, block)
-
-
-def _product_shared(a: Any, b: Any, out: Any, first: Any) -> None:
-    """All columns, in blocks that the cores share."""
-    for block in prange((b.shape[1] + COLUMNS - 1) // COLUMNS):
-        _block(a, b, out, first, block)
-
-
 def _compile(function: Any, signature: Any, *, shared: bool) -> Any:
     """A loop as machine code, kept beside Python's own byte code where that can be written, so that only the first process waits.
 
@@ -258,16 +196,8 @@ def _shared_loop() -> Any:
     return _compile(_loop_shared, _LOOP, shared=True)
 
 
-@cache
-def _shared_product() -> Any:
-    """As `_shared_loop`."""
-    return _compile(_product_shared, _PRODUCT, shared=True)
-
-
 _inlined = numba.njit(forceinline=True, fastmath={"contract"})
-_find, _sum, _deviation, _part, _block = (_inlined(f) for f in (_locate, _lane, _point, _chunk, _columns))
+_find, _sum, _deviation, _part = (_inlined(f) for f in (_locate, _lane, _point, _chunk))
 _READ = numba.types.Array(numba.float64, 1, "C", readonly=True)
 _LOOP = numba.void(_READ, _READ, _READ, _READ, numba.float64[:, ::1], numba.int64[::1], numba.float64[::1])
-_PRODUCT = numba.void(numba.float64[:, :], numba.float64[:, ::1], numba.float64[:, ::1], numba.int64)
 _compiled = _compile(_loop, _LOOP, shared=False)
-_compiled_product = _compile(_product, _PRODUCT, shared=False)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cache
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F2
 from tests.experiments.kernel import kernel
@@ -22,7 +22,6 @@ class Compiled:
     """The compiled kernels (`tests.experiments.kernel.compiled`), and how many cores they use when asked for all."""
 
     scattered: Callable[..., F2]
-    grid: Callable[..., NDArray[np.float64]]
     threads: Callable[[], int]
 
 
@@ -33,7 +32,7 @@ def compiled_path() -> Compiled | None:
         from tests.experiments.kernel import compiled
     except ImportError:
         return None
-    return Compiled(compiled.scattered, compiled.grid, compiled.threads)
+    return Compiled(compiled.scattered, compiled.threads)
 
 
 def scattered(tables: TableMachine, axes_mm: ArrayLike, out: F2 | None = None, *, all_cores: bool = False) -> F2:
@@ -48,24 +47,6 @@ def scattered(tables: TableMachine, axes_mm: ArrayLike, out: F2 | None = None, *
     if len(np.atleast_1d(axes)) >= WORTH_COMPILING and (found := compiled_path()) is not None:
         return found.scattered(tables, axes, out, all_cores=all_cores)
     return kernel.scattered(tables, axes, out)
-
-
-def grid(
-    tables: TableMachine,
-    x_mm: ArrayLike,
-    y_mm: ArrayLike,
-    z_mm: ArrayLike,
-    out: NDArray[np.float64] | None = None,
-    *,
-    all_cores: bool = False,
-) -> NDArray[np.float64]:
-    """First-order deviation on a full grid, by the path that suits; parameters, result and errors as in `kernel.grid`.
-
-    ``all_cores`` as in `scattered`.
-    """
-    if np.size(x_mm) * np.size(y_mm) * np.size(z_mm) >= WORTH_COMPILING and (found := compiled_path()) is not None:
-        return found.grid(tables, x_mm, y_mm, z_mm, out, all_cores=all_cores)
-    return kernel.grid(tables, x_mm, y_mm, z_mm, out)
 
 
 def path(*, all_cores: bool = False) -> str:

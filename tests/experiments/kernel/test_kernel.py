@@ -35,17 +35,6 @@ def scattered(request, require):
     return partial(compiled.scattered, all_cores=request.param == "all cores")
 
 
-@pytest.fixture(params=["numpy", "compiled", "all cores"])
-def grid(request, require):
-    """The same for the grid."""
-    if request.param == "numpy":
-        return kernel.grid
-    require("numba", importlib.util.find_spec("numba") is not None, NO_NUMBA)
-    from tests.experiments.kernel import compiled
-
-    return partial(compiled.grid, all_cores=request.param == "all cores")
-
-
 def machine(chain="w-X-Y-b-Z-t", seed=1, squareness=(30e-6, -20e-6, 45e-6)):
     """Pivots, tool and tables at random; the tables do not cover the stroke, and each axis has another number of nodes."""
     rng = np.random.default_rng(seed)
@@ -75,36 +64,10 @@ def test_any_points_of_any_chain_are_those_of_the_plain_chain(chain, scattered):
     assert np.abs(scattered(tables, p) - expected).max() < TOLERANCE_MM
 
 
-@pytest.mark.parametrize("chain", all_chains())
-def test_a_grid_is_its_points(chain, grid):
-    rng, tables = np.random.default_rng(5), machine(chain, 7)
-    x, y, z = (rng.uniform(r[0] - 60, r[1] + 60, n) for r, n in zip(RANGE, (4, 6, 5), strict=True))
-    x[0], y[1] = RANGE[0, 1], RANGE[1, 0]
-    p = np.stack(np.meshgrid(x, y, z, indexing="ij"), axis=-1)
-    assert np.abs(grid(tables, x, y, z) - plain(tables, p.reshape(-1, 3)).reshape(p.shape)).max() < TOLERANCE_MM
-
-
-def test_a_grid_worked_on_in_parts_is_the_same_grid(monkeypatch, grid):
-    tables = machine()
-    axes = [np.linspace(*r, n) for r, n in zip(RANGE, (3, 11, 4), strict=True)]
-    whole = grid(tables, *axes)
-    for chunk in (13, 3, 2, 1):  # 13: several Y at once; below 4: Z in parts as well; 2: X too
-        monkeypatch.setattr(kernel, "_GRID_CHUNK", chunk)
-        assert np.abs(grid(tables, *axes) - whole).max() < 1e-15
-
-
-def test_a_grid_larger_than_any_tile_is_its_points(grid):
-    tables = machine("w-Y-b-X-Z-t")
-    axes = [np.linspace(*r, n) for r, n in zip(RANGE, (37, 41, 29), strict=True)]
-    p = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    assert np.abs(grid(tables, *axes) - plain(tables, p.reshape(-1, 3)).reshape(p.shape)).max() < TOLERANCE_MM
-
-
 def test_squareness_alone_is_position_times_angle_by_hand(scattered):
     tables = TableMachine(Machine("w-b-X-Y-Z-t", STROKE), RANGE, tuple(np.zeros((2, 6)) for _ in range(3)), np.array([1e-5, 2e-5, 3e-5]))
     expected = [[-1e-5 * 200 + 2e-5 * 900, -3e-5 * 900, 0.0]]
     np.testing.assert_allclose(scattered(tables, [[700.0, 200.0, 900.0]]), expected, rtol=1e-13)
-    np.testing.assert_allclose(kernel.grid(tables, [700.0], [200.0], [900.0])[0, 0], expected, rtol=1e-13)
 
 
 def test_an_angle_alone_turns_lever_and_tool_by_hand(scattered):
@@ -115,7 +78,6 @@ def test_an_angle_alone_turns_lever_and_tool_by_hand(scattered):
     ecx = 1.5e-5
     expected = [[-ecx * (50.0 + 2.0 - 7.0), ecx * (100.0 + 1.0 - 5.0), 0.0]]
     np.testing.assert_allclose(scattered(tables, [[100.0, 50.0, 20.0]]), expected, rtol=1e-13)
-    np.testing.assert_allclose(kernel.grid(tables, [100.0], [50.0], [20.0])[0, 0], expected, rtol=1e-13)
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 4095, 4096, 4097, 16385])
@@ -148,15 +110,6 @@ def test_nan_or_infinite_in_gives_nan_out_in_its_own_row_only(chain, axis, what,
         assert np.abs(result[rest] - expected[rest]).max() < TOLERANCE_MM
 
 
-@pytest.mark.parametrize("what", [np.nan, np.inf, -np.inf])
-def test_nan_or_infinite_on_a_grid_stays_in_its_plane(what, grid):
-    tables = machine()
-    found = grid(tables, [100.0, what], [200.0, 300.0], [what, 100.0])
-    assert np.isnan(found[1]).all()
-    assert np.isnan(found[:, :, 0]).all()
-    assert np.isfinite(found[0, :, 1]).all()
-
-
 def test_read_only_and_strided_positions_are_taken(scattered):
     tables, p = machine(), points(50)
     wide = np.zeros((50, 5))
@@ -177,11 +130,9 @@ def test_out_must_not_be_the_positions(scattered):
         scattered(machine(), p, p)
 
 
-def test_an_out_that_is_no_array_is_refused(scattered, grid):
+def test_an_out_that_is_no_array_is_refused(scattered):
     with pytest.raises(ValueError, match=r"out must be .* got list"):
         scattered(machine(), points(1), [[0.0, 0.0, 0.0]])
-    with pytest.raises(ValueError, match=r"out must be .* got list"):
-        grid(machine(), [1.0], [1.0], [1.0], [[[[0.0, 0.0, 0.0]]]])
 
 
 def test_plain_motions_take_lists_and_refuse_other_shapes():
@@ -209,8 +160,6 @@ def test_without_numba_the_automatic_choice_is_numpy(monkeypatch):
         tables, p = machine(), points(10)
         assert fast.path() == "numpy"
         assert (fast.scattered(tables, p) == kernel.scattered(tables, p)).all()
-        axes = [1.0, 200.0], [300.0, 400.0], [5.0, 6.0]
-        assert (fast.grid(tables, *axes) == kernel.grid(tables, *axes)).all()
     finally:
         fast.compiled_path.cache_clear()
 
@@ -221,7 +170,6 @@ def test_with_numba_the_automatic_choice_compiles_when_points_are_many(require, 
     spied = replace(
         found,
         scattered=lambda *a, **k: used.append("scattered") or found.scattered(*a, **k),
-        grid=lambda *a, **k: used.append("grid") or found.grid(*a, **k),
     )
     tables, p = machine(), points(12)
     monkeypatch.setattr(fast, "WORTH_COMPILING", 12)
@@ -229,12 +177,7 @@ def test_with_numba_the_automatic_choice_compiles_when_points_are_many(require, 
     assert fast.path() == "compiled, 1 thread"
     assert np.abs(fast.scattered(tables, p) - kernel.scattered(tables, p)).max() < TOLERANCE_MM
     assert used == ["scattered"]
-    axes = [1.0, 200.0], [300.0, 400.0, 1.0], [5.0, 6.0]
-    assert np.abs(fast.grid(tables, *axes) - kernel.grid(tables, *axes)).max() < TOLERANCE_MM
-    assert used == ["scattered", "grid"]
     fast.scattered(tables, p[:11])
-    fast.grid(tables, *axes[:2], [5.0])
-    assert used == ["scattered", "grid"]
 
 
 def test_tables_sampled_from_functions_are_those_functions_at_the_nodes():
@@ -262,11 +205,8 @@ def test_what_is_no_table_machine_is_refused():
         TableMachine(nominal, RANGE, (good, good))
     with pytest.raises(ValueError, match="range_mm"):
         TableMachine(nominal, RANGE[:, ::-1], (good, good, good))
-    with pytest.raises(ValueError, match="grid positions"):
-        kernel.grid(machine(), 1.0, [1.0], [1.0])
     with pytest.raises(ValueError, match="block"):
         kernel.scattered(machine(), points(3), block=0)
-    assert kernel.grid(machine(), [], [1.0], [1.0]).shape == (0, 1, 1, 3)
 
 
 def test_a_table_machine_cannot_be_changed_from_outside():

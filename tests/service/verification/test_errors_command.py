@@ -14,6 +14,7 @@ import pytest
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
+from abbe.models.geometry import field
 from abbe.service.runs import points as points_file
 from abbe.service.verification import deviations as workflow
 from abbe.service.verification.deviations import standard_uncertainty_mm
@@ -334,7 +335,7 @@ def test_the_pieces_are_one_document_and_the_blocks_one_file(bench: Bench, monke
     whole = bench("--json", "--exact").out
     assert whole == json.dumps(json.loads(whole), ensure_ascii=False) + "\n"
     assert len(json.loads(whole)["points"]) == 12
-    monkeypatch.setattr(workflow, "CHUNK", 5)
+    monkeypatch.setattr(field, "BLOCK", 5)
     monkeypatch.setattr(workflow, "ROWS", 5)
     monkeypatch.setattr(points_file, "BLOCK", 5)
     assert bench("--json", "--exact").out == whole

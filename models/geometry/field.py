@@ -1,0 +1,196 @@
+"""Deviation by rule G at many points, with two ideas that keep the digits: a grid is a product of matrices, and blocks stay in the cache.
+
+Every error motion depends on the position of its own axis only. On a full grid rule G is therefore a sum of eight terms, each a number of X
+times a number of the Y-Z plane: the functions are evaluated on three lines, and the rest is one product of matrices, (nx, 8) by
+(8, 3 ny nz). Points in any other order are worked off in blocks. Both are shared among the processor's cores
+(docs/decisions/0046-a-map-is-numpy.md).
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextvars import copy_context
+
+import numpy as np
+from numpy.typing import NDArray
+
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.geometry.chain import deviation_mm
+from abbe.models.geometry.rotation import cross
+from abbe.models.machine import Machine, lever_masks, levers_mm
+
+BLOCK = 4096
+"""Points in one block: 18 motions of them are 0.6 MB."""
+SHARED = 65_536
+"""Points from which on blocks are shared among the cores; below, starting threads costs more than it saves."""
+CORES = 4
+"""Largest number of threads: more wait for memory."""
+LEAST = 512
+"""Points from which on it is worth looking whether they are a grid."""
+TILE = (32, 1000)
+"""Rows and columns of one product: with 8 in between fewer than 2**18 multiplications, from which on OpenBLAS starts threads of its own."""
+
+Motions = Callable[[F2], F3]
+Lines = tuple[F1, F1, F1]
+
+
+def field_mm(machine: Machine, motions: Motions, axes_mm: F2) -> F2:
+    """Return the deviation of the machine's functional point at many positions, as `abbe.models.geometry.chain.deviation_mm` does.
+
+    Parameters
+    ----------
+    motions : function
+        Error motions at positions, shape (n, 3) -> (n, 3 axes, 6), mm and rad, squareness included. The motions of an axis must depend on
+        the position of this axis only, and several threads may call it at once.
+    axes_mm : array, shape (n, 3)
+        Commanded positions. A full grid, X slowest, is recognised.
+
+    Returns
+    -------
+    array, shape (n, 3)
+        Actual minus nominal, tool relative to workpiece, mm. Both ways agree to rounding, about 1e-15 mm.
+
+    Raises
+    ------
+    ValueError
+        The shape is wrong.
+    """
+    lines = grid_lines(axes_mm)
+    if lines is not None:
+        return grid_mm(machine, lines, line_motions(motions, lines)).reshape(-1, 3)
+    out: F2 = np.empty((len(axes_mm), 3))
+
+    def block(rows: slice) -> None:
+        out[rows] = deviation_mm(machine, axes_mm[rows], motions(axes_mm[rows]))
+
+    in_blocks(len(axes_mm), block)
+    return out
+
+
+def in_blocks(count: int, work: Callable[[slice], None], *, weight: int = 1) -> None:
+    """Call ``work`` for slices that cover ``count`` rows, in any order; on several cores if they are many.
+
+    ``weight``: points in one row. A slice holds `BLOCK` points or, where a row is more, one row.
+    """
+    size = max(1, BLOCK // weight)
+    blocks = [slice(start, min(start + size, count)) for start in range(0, count, size)]
+    rest = iter(blocks)
+
+    def run() -> None:
+        for one in rest:  # the threads share the iterator, so a core that is busy otherwise takes fewer
+            work(one)
+
+    helpers = min(_cores(), CORES, len(blocks)) - 1 if count * weight >= SHARED else 0
+    if helpers < 1:
+        run()
+        return
+    with ThreadPoolExecutor(helpers, thread_name_prefix="abbe-field") as pool:
+        others = [pool.submit(copy_context().run, run) for _ in range(helpers)]  # numpy's error state belongs to the context
+        run()
+    for one in others:
+        one.result()
+
+
+def grid_lines(axes_mm: F2) -> Lines | None:
+    """Return the positions of X, Y and Z if the points, shape (n, 3), are exactly a full grid with X slowest and Z fastest, else None."""
+    count = len(axes_mm)
+    if count < LEAST or axes_mm.shape[1:] != (3,):
+        return None
+    nz = _first_change(axes_mm[:, 1])
+    ny = _first_change(axes_mm[::nz, 0]) if nz else 0
+    if min(nz, ny) < 2 or count % (nz * ny):
+        return None
+    grid = np.asarray(axes_mm).reshape(-1, ny, nz, 3)
+    lines = grid[:, 0, 0, 0].copy(), grid[0, :, 0, 1].copy(), grid[0, 0, :, 2].copy()
+    differing = []
+
+    def planes(rows: slice) -> None:
+        plane = np.empty(grid.shape[1:])
+        plane[..., 1], plane[..., 2] = lines[1][:, None], lines[2]
+        for k in range(rows.start, rows.stop):
+            plane[..., 0] = lines[0][k]
+            if differing or not np.array_equal(grid[k], plane):
+                differing.append(k)
+                return
+
+    in_blocks(len(grid), planes, weight=ny * nz)
+    return None if differing else lines
+
+
+def line_motions(motions: Motions, lines: Lines) -> tuple[F2, F2, F2]:
+    """Return the six motions of X, Y and Z along their lines, shape (n_axis, 6) each, from one call of the function."""
+    at: F2 = np.empty((max(line.size for line in lines), 3))
+    for a, line in enumerate(lines):
+        at[: line.size, a], at[line.size :, a] = line, line[-1]
+    values = motions(at)
+    x, y, z = (values[: line.size, a] for a, line in enumerate(lines))
+    return x, y, z
+
+
+def grid_mm(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> F4:
+    """Return the deviation on the full grid of three lines of positions, which need be neither even nor sorted.
+
+    Parameters
+    ----------
+    lines : three arrays, shape (nx,), (ny,), (nz,)
+        Commanded positions of X, Y and Z.
+    motions : three arrays, shape (nx, 6), (ny, 6), (nz, 6)
+        EX EY EZ (mm, squareness included) and EA EB EC (rad) of the X, Y and Z carriage there, ISO signs.
+
+    Returns
+    -------
+    array, shape (nx, ny, nz, 3)
+        Actual minus nominal, tool relative to workpiece, mm.
+    """
+    nx, ny, nz = (line.size for line in lines)
+    out: F4 = np.empty((nx, ny, nz, 3))
+    moved = [_own(machine, a, lines[a], motions[a]) for a in range(3)]
+    of_x = np.concatenate([np.ones((nx, 1)), lines[0][:, None], moved[0], motions[0][:, 3:]], axis=1)
+    of_yz = _plane(lever_masks(machine.chain), lines, moved, motions).reshape(8, -1)
+    flat = out.reshape(nx, -1)
+
+    def columns(tiles: slice) -> None:
+        for j in range(tiles.start * TILE[1], tiles.stop * TILE[1], TILE[1]):
+            for i in range(0, nx, TILE[0]):
+                tile = flat[i : i + TILE[0], j : j + TILE[1]]
+                np.matmul(of_x[i : i + TILE[0]], of_yz[:, j : j + TILE[1]], out=tile)
+
+    in_blocks(-(-flat.shape[1] // TILE[1]), columns, weight=nx * TILE[1] // 3)
+    return out
+
+
+def _own(machine: Machine, axis: int, line_mm: F1, motions: F2) -> F2:
+    """Return what a carriage adds that depends on its own position alone, shape (n, 3): translation, and rotation of its constant arm."""
+    at = np.zeros((line_mm.size, 3))
+    at[:, axis] = line_mm
+    return np.asarray(motions[:, :3] + cross(motions[:, 3:], levers_mm(machine, at)[:, axis]))
+
+
+def _plane(mask: F3, lines: Lines, moved: list[F2], motions: tuple[F2, F2, F2]) -> NDArray[np.float64]:
+    """Return what stands beside 1, x, EX EY EZ and EA EB EC of X in the Y-Z plane, shape (8, ny, nz, 3)."""
+    (_, y, z), unit = lines, np.eye(3)
+    turned = [[mask[a, b] * np.cross(motions[a][:, 3:], unit[b]) for b in range(3)] for a in range(3)]
+    out = np.zeros((8, y.size, z.size, 3))
+    out[0] = moved[1][:, None] + moved[2][None]
+    out[0] += turned[1][2][:, None] * z[None, :, None] + turned[2][1][None] * y[:, None, None]
+    out[1] = turned[1][0][:, None] + turned[2][0][None]
+    out[2:5] = unit[:, None, None]
+    lever_y, lever_z = mask[0, 1] * y[:, None], mask[0, 2] * z[None]
+    out[5, :, :, 1], out[5, :, :, 2] = -lever_z, lever_y
+    out[6, :, :, 0], out[7, :, :, 0] = lever_z, -lever_y
+    return out
+
+
+def _first_change(values: F1) -> int:
+    """Return the index of the first value that differs from the one at index 0, or the number of values."""
+    for size in (LEAST, values.size):
+        differs = values[:size] != values[0]
+        if differs.any():
+            return int(np.argmax(differs))
+    return int(values.size)
+
+
+def _cores() -> int:
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
