@@ -2,13 +2,12 @@
 
 Every error motion depends on the position of its own axis only. On a full grid rule G is therefore a sum of eight terms, each a number of X
 times a number of the Y-Z plane: the functions are evaluated on three lines, and the rest is one product of matrices, (nx, 8) by
-(8, 3 ny nz). Points in any other order are worked off in blocks. Both are shared among the processor's cores
+(8, 3 ny nz). Points in any other order are worked off in blocks. Both are shared between two threads
 (docs/decisions/0046-a-map-is-numpy.md).
 """
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextvars import copy_context
@@ -25,8 +24,8 @@ BLOCK = 4096
 """Points in one block: 18 motions of them are 0.6 MB."""
 SHARED = 65_536
 """Points from which on blocks are shared among the cores; below, starting threads costs more than it saves."""
-CORES = 4
-"""Largest number of threads: more wait for memory."""
+CORES = 2
+"""Number of threads for many points: more wait for memory, and on one core a second thread costs little."""
 LEAST = 512
 """Points from which on it is worth looking whether they are a grid."""
 TILE = (32, 1000)
@@ -70,7 +69,7 @@ def field_mm(machine: Machine, motions: Motions, axes_mm: F2) -> F2:
 
 
 def in_blocks(count: int, work: Callable[[slice], None], *, weight: int = 1) -> None:
-    """Call ``work`` for slices that cover ``count`` rows, in any order; on several cores if they are many.
+    """Call ``work`` for slices that cover ``count`` rows, in any order; by several threads if they are many.
 
     ``weight``: points in one row. A slice holds `BLOCK` points or, where a row is more, one row.
     """
@@ -82,7 +81,7 @@ def in_blocks(count: int, work: Callable[[slice], None], *, weight: int = 1) -> 
         for one in rest:  # the threads share the iterator, so a core that is busy otherwise takes fewer
             work(one)
 
-    helpers = min(_cores(), CORES, len(blocks)) - 1 if count * weight >= SHARED else 0
+    helpers = min(CORES, len(blocks)) - 1 if count * weight >= SHARED else 0
     if helpers < 1:
         run()
         return
@@ -190,7 +189,3 @@ def _first_change(values: F1) -> int:
         if differs.any():
             return int(np.argmax(differs))
     return int(values.size)
-
-
-def _cores() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

@@ -74,7 +74,7 @@ def test_a_grid_costs_three_lines_of_every_motion() -> None:
 @pytest.mark.parametrize("cores", [1, 2])
 @pytest.mark.parametrize("sides", [(50, 40, 45), (2, 200, 190), (300, 2, 130)])
 def test_many_points_are_shared_among_cores_and_stay_the_same(cores: int, sides, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(field, "_cores", lambda: cores)
+    monkeypatch.setattr(field, "CORES", cores)
     points, m = grid(sides), machine()
     assert len(points) >= field.SHARED
     expected = plain(m, points)
@@ -98,7 +98,7 @@ def test_what_is_no_full_grid_or_too_small_is_worked_off_point_by_point(points: 
 
 
 def test_blocks_cover_every_row_once_and_an_error_in_one_comes_out(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(field, "_cores", lambda: 3)
+    monkeypatch.setattr(field, "CORES", 3)
     for count, weight in ((0, 1), (1, 1), (field.SHARED + 5, 1), (70, 1000)):
         seen = np.zeros(count, dtype=int)
 
@@ -116,7 +116,7 @@ def test_blocks_cover_every_row_once_and_an_error_in_one_comes_out(monkeypatch: 
 
 
 def test_a_thread_keeps_the_error_state_of_its_caller(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(field, "_cores", lambda: 2)
+    monkeypatch.setattr(field, "CORES", 2)
     with warnings.catch_warnings(), np.errstate(all="ignore"):
         warnings.simplefilter("error")
         in_blocks(field.SHARED, lambda rows: np.full(rows.stop - rows.start, 1e308) * 10.0)
