@@ -116,7 +116,7 @@ def term_motions(terms: tuple[Term, ...], coefficients: F1, axes_mm: F2, stroke_
     weight = np.zeros((3, layout.highest + 1, 6))
     (order, axis), component = np.divmod(layout.row[own], 3), layout.motion[own] % 6
     np.add.at(weight, (axis, order, component), coefficients[own])
-    np.subtract.at(weight, (axis, 0, component), coefficients[own] * layout.at_start[own])
+    np.subtract.at(weight[:, 0], (axis, component), coefficients[own] * layout.at_start[own])
     start, travel_mm = stroke_mm[:, :1], np.asarray(axes_mm).T - stroke_mm[:, :1]
     u = np.minimum(np.maximum(2.0 * travel_mm / (stroke_mm[:, 1:] - start) - 1.0, -1.0), 1.0)
     out: F3 = np.empty((travel_mm.shape[1], 3, 6))

@@ -3,7 +3,7 @@
 Every error motion depends on the position of its own axis only. On a full grid rule G is therefore a sum of eight terms, each a number of X
 times a number of the Y-Z plane: the functions are evaluated on three lines, and the rest is one product of matrices, (nx, 8) by
 (8, 3 ny nz). Points in any other order are worked off in blocks. Both are shared between two threads
-(docs/decisions/0046-a-map-is-numpy.md).
+(docs/decisions/0047-a-map-is-numpy.md).
 """
 
 from __future__ import annotations
@@ -103,7 +103,7 @@ def grid_lines(axes_mm: F2) -> Lines | None:
         return None
     grid = np.asarray(axes_mm).reshape(-1, ny, nz, 3)
     lines = grid[:, 0, 0, 0].copy(), grid[0, :, 0, 1].copy(), grid[0, 0, :, 2].copy()
-    differing = []
+    differing: list[int] = []
 
     def planes(rows: slice) -> None:
         plane = np.empty(grid.shape[1:])
