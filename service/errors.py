@@ -202,7 +202,7 @@ class PreconditionsChanged(AbbeError):
 
 
 class SetupDisturbed(AbbeError):
-    """A mounted instrument or target has moved: it must be mounted again."""
+    """A mounted instrument, stylus or target has moved or changed: it must be mounted again."""
 
     code = "SEQ-008"
 
@@ -256,7 +256,7 @@ class FalseTrips(ProbeFault):
 
 
 class ProbeUncalibrated(ProbeFault):
-    """A feature's radius shows that the stylus is not the stated one, or no longer as it was qualified."""
+    """A feature's radius shows that the stylus is not the stated one, or not qualified."""
 
     code = "PRB-005"
 

@@ -31,8 +31,8 @@ COARSE, FINE, NEAR = 0.3, 0.06, 2
 width in fine steps."""
 APART = 4
 """Coarse steps between the two periods of a pair, at least: closer ones are one period with a changing amplitude."""
-LIKELY = 60
-"""Number of pairs whose neighbourhood is searched finely."""
+LIKELY, MOST = 60, 700
+"""Number of pairs whose neighbourhood is searched finely; of coarse frequencies that form pairs: on longer ways, those best alone."""
 SCATTER_MM = tuple(float(v) for v in np.geomspace(3e-5, 4e-3, 9))
 """Standard deviations of the scatter from position to position that are tried, equally probable."""
 
@@ -104,7 +104,7 @@ def peaks(data: Displacements) -> tuple[Peak, ...]:
     alone = np.arange(frequency.size)
     for axes, belief in _hypotheses(tuple(sorted(set(data.axis.tolist())))):
         single = log_prior + np.log((1.0 - TWO) * belief) + _evidence(data, levels, axes, (frequency,))
-        one, two = _pairs(data, levels, axes, frequency, log_prior)
+        one, two = _pairs(data, levels, axes, frequency, log_prior, single)
         joint = _evidence(data, levels, axes, (frequency[one], frequency[two]))
         both = log_prior[one] + log_prior[two] + np.log(2.0 * TWO * belief) + joint
         total += [np.logaddexp.reduce(single), np.logaddexp.reduce(both)]
@@ -141,13 +141,16 @@ def _evidence(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tup
     return _mixed(out)
 
 
-def _pairs(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequency: F1, log_prior: F1) -> Pair:
+def _pairs(
+    data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequency: F1, log_prior: F1, single: F1
+) -> Pair:
     """Pairs of frequencies around the best ones of a coarse search that takes the axes for independent, each once."""
     step = round(COARSE / FINE)
     coarse = np.arange(0, frequency.size, step)
+    coarse = np.sort(coarse[np.argsort(-single[coarse])[:MOST]])
     waves = [data.waves((a,), frequency[coarse]) for a in axes]
     value = _mixed([base + np.sum([_gain_of_pairs(w, h, information) for w in waves], axis=0) for h, information, base in levels[::2]])
-    one, two = np.triu_indices(coarse.size, APART)
+    one, two = np.nonzero(coarse[None, :] - coarse[:, None] >= APART * step)
     best = np.argsort(-(value[one, two] + log_prior[coarse[one]] + log_prior[coarse[two]]))[:LIKELY]
     shift = np.arange(-NEAR, NEAR + 1)
     near = np.broadcast_arrays(coarse[one[best]][:, None, None] + shift[:, None], coarse[two[best]][:, None, None] + shift)

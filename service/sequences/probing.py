@@ -230,10 +230,9 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
 
     Raises
     ------
-    ProbeUncalibrated
-        Its radius has changed by more than `QUALIFIED_MM` and its uncertainty: the qualification of the stylus has drifted.
     SetupDisturbed
-        It has moved.
+        Its radius has changed by more than `QUALIFIED_MM` and its uncertainty, so the stylus is no longer as it was qualified; or it has
+        moved.
     """
     before = next((one for one in earlier if one.feature == touched.feature), None)
     if before is None:
@@ -241,10 +240,10 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
     then, now = found_feature(before), found_feature(touched)
     drift, expanded = now.radius_mm - then.radius_mm, COVERAGE * math.hypot(then.u_radius_mm, now.u_radius_mm)
     if abs(drift) > QUALIFIED_MM + expanded:
-        raise ProbeUncalibrated(
+        raise SetupDisturbed(
             f"feature {touched.feature}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um while {len(earlier)} features "
             "were touched: the stylus is no longer as it was qualified",
-            "tighten or change the stylus, qualify it, and measure this pose from the beginning",
+            "its points so far are kept as evidence; tighten or change the stylus, qualify it, and the pose is measured from the beginning",
         )
     moved = math.dist(now.centre_mm, then.centre_mm)
     if moved > MOVED_MM:
