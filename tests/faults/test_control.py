@@ -144,7 +144,9 @@ def acting(b: Bench, step: int, how: Callable[[Control], None], *, moving: bool)
 
 @pytest.mark.timeout(1800 if LONG else 150)
 async def test_pause_and_resume_at_every_step(place, undisturbed):
-    """Between points the same commands come as without the pause; a path is held, given up, and measured again after the way back."""
+    """Between points the same commands come as without the pause, and an artefact's first feature is touched again; a path is held, given
+    up, and measured again after the way back.
+    """
     b, store = place
     tried = 0
     for case in cases():
@@ -161,10 +163,19 @@ async def test_pause_and_resume_at_every_step(place, undisturbed):
             assert runs == [("test", "aborted"), ("test-2", "complete")], case
             _held_and_again(lines, plain, case)
         else:
-            assert lines == plain, case
+            assert _without_first_feature_again(lines, plain) == plain, case
             assert runs == [("test", "complete")], case
         tried += 1
     assert tried >= 10
+
+
+def _without_first_feature_again(lines: list[Line], plain: list[Line]) -> list[Line]:
+    """The commands without those that touch the first feature again, which have to be the first touches of all."""
+    more = len(lines) - len(plain)
+    at = next((k for k, (one, as_ever) in enumerate(zip(lines, plain, strict=False)) if one != as_ever), len(plain))
+    between = [one for one in lines[at : at + more] if one[0] == "touch"]
+    assert sorted(between) == sorted([one for one in plain if one[0] == "touch"][: len(between)])
+    return lines[:at] + lines[at + more :]
 
 
 def _held_and_again(lines: list[Line], plain: list[Line], case: Case) -> None:
