@@ -22,8 +22,8 @@ PERIODS_MM = (4.0, 60.0)
 """Range of the searched periods."""
 LEADS_MM = (5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0)
 USUAL, SMOOTH, ALL_AXES, TWO = 0.7, 0.3, 0.7, 0.3
-"""Prior probabilities: a period is the lead of a usual screw; there is no period; all axes have the same one; a period has a second one
-beside it."""
+"""Prior probabilities that a period is the lead of a usual screw, that there is none, and that all axes have the same one. Of two periods
+each may be none, so that they count `TWO` times 1 - `SMOOTH` beside 1 - `TWO` of one; the posterior is normalised."""
 LEAST = 0.05
 """Least probability of a period that enters the model."""
 COARSE, FINE, NEAR = 0.3, 0.06, 2

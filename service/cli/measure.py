@@ -146,8 +146,8 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
 
     record = store.campaigns.find(campaign)
     started = datetime.fromisoformat(record.created_utc)
-    runs = [load_run(store, run.id) for run in store.runs.all(record.id) if run.visible_status == "complete"]
     try:
+        runs = [load_run(store, run.id) for run in store.runs.all(record.id) if run.visible_status == "complete"]
         result = judged(config, runs, campaign, started, SystemClock().monotonic_s() - begun_s)
     except MeasurementFault as fault:
         return {"verdict": "not judged", "text": fault.detail}, f"not judged: {fault.detail}"

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import asyncio
 import secrets
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from datetime import UTC, date, datetime, time, timedelta
 from typing import Any
@@ -90,18 +90,21 @@ def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     if not air or not np.isfinite(air).all():
         air = [float("nan")]
     p = promise.predicted
-    until = tuple(until_s(site.calibrated_until[kind]) for kind in sorted(_instruments(used)) if kind in site.calibrated_until)
-    known = until if len(until) == len(_instruments(used)) else ()
     drift = 0.0 if promise.drift_mm is None else promise.drift_mm
     return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
-        mark_of(r.table.boot_id for r in used), known,
+        mark_of(r.table.boot_id for r in used), certified_until_s(site.calibrated_until, _instruments(used)),
         promise.last_s, reached_mm(used),
     )  # fmt: skip
 
 
 def _instruments(runs: list[Run]) -> set[str]:
     return {r.instrument for r in runs}
+
+
+def certified_until_s(days: Mapping[str, date], instruments: set[str]) -> tuple[float, ...]:
+    """Ends of the certificates of these instruments; none if one of them has no certificate."""
+    return tuple(until_s(days[kind]) for kind in sorted(instruments)) if instruments <= days.keys() else ()
 
 
 def until_s(day: date) -> float:

@@ -34,6 +34,7 @@ def found_feature(touched: TouchedFeature) -> FoundFeature:
     each = [np.asarray(side, dtype=np.float64) for side in touched.touches_mm]
     means, free = np.array([side.mean(axis=0) for side in each]), _free(sides)
     centre, radius = target.copy(), float(np.einsum("ni,ni->n", means - target, sides).mean())
+    slope = np.empty((0, 0))
     for _ in range(ROUNDS):
         away = (means - centre) @ free.T
         distance = np.linalg.norm(away, axis=1)
@@ -43,7 +44,8 @@ def found_feature(touched: TouchedFeature) -> FoundFeature:
     left = np.concatenate([(side - mean) @ way for side, mean, way in zip(each, means, sides, strict=True)])
     degrees = sum(len(side) - 1 for side in each)
     spread = float(np.sqrt(np.sum(left**2) / max(degrees, 1)))
-    u_radius = float(np.hypot(spread / np.sqrt(sum(map(len, each))), touched.resolution_mm / np.sqrt(12.0 * len(each))))
+    u_side = np.hypot(spread / np.sqrt(np.mean([len(side) for side in each])), touched.resolution_mm / np.sqrt(12.0))
+    u_radius = float(u_side * np.sqrt(np.linalg.inv(slope.T @ slope)[-1, -1]))
     return FoundFeature(centre, radius, spread, u_radius)
 
 

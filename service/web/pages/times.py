@@ -101,7 +101,8 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
 def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
     """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970.
 
-    ``value``, ``u``: as text, rounded together, between spaces. Columns of the chart have a place for each point, None where it has none.
+    ``value``, ``u``: as text, rounded together, between spaces; ``bare``: places and values of the points without U, which nothing rounds.
+    Columns of the chart have a place for each point, None where it has none.
     """
     frame = current()
     name, unit = language.figure(frame.lang, chart.figure)
@@ -119,6 +120,7 @@ def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, mark
         "x": [_s(point.at) for point in points],
         "value": " ".join(value for value, _ in shown),
         "u": " ".join(u for _, u in shown),
+        "bare": [[k, _short(point.value)] for k, point in enumerate(points) if not point.uncertainty > 0.0],
         "limit": [[k, one] for k, one in enumerate(limits) if not k or one != limits[k - 1]],
         "verdict": "".join(str(VERDICTS.index(point.verdict)) for point in points),
         "earlier": sum(point.earlier for point in points),

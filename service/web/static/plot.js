@@ -422,7 +422,9 @@ class Trend extends Box {
 // The series as they are drawn: value and U come as text, a limit as the points from which it holds.
 function opened(told) {
   const texts = [told.value, told.u].map((text) => text.split(" "));
-  const [y, u] = texts.map((list) => list.map((text) => Number(text.replace("−", "-")) || 0));
+  const [y, u] = texts.map((list) => list.map((text) => Number(text.replace("−", "-"))));
+  u.forEach((one, k) => { if (Number.isNaN(one)) u[k] = 0; });
+  for (const [k, value] of told.bare) y[k] = value;
   const limit = told.x.map((_, k) => told.limit.findLast(([from]) => from <= k)[1]);
   const begins = told.x[told.chart.high.findIndex((one) => one !== null)];
   return { ...told, y, u, limit, limits: parts(told.x, limit), begins, shown: texts[0].map((text, k) => [text, texts[1][k]]) };

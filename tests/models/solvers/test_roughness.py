@@ -75,8 +75,9 @@ def test_no_period_is_claimed_where_there_is_none(smooth, rough):
 
 def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_than_no_map(smooth, rough):
     truth, found = rough
-    assert max(t.order for t in smooth.terms) == SMOOTH_ORDER
-    assert rough_lines(smooth) == ()
+    for one in (smooth, solve_joint(MACHINE, Truth(7).campaign())):
+        assert max(t.order for t in one.terms) == SMOOTH_ORDER
+        assert rough_lines(one) == ()
     assert max(t.order for t in found.terms) > SMOOTH_ORDER
     assert rough_lines(found)
     p = np.random.default_rng(1).uniform(MACHINE.stroke_mm[:, 0], MACHINE.stroke_mm[:, 1], (300, 3))
