@@ -22,12 +22,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 
 from tests.built_once import _commands_built_once, _schema_built_once  # noqa: F401 - fixtures of every test
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
-settings.register_profile("fixed", derandomize=True, database=None, max_examples=100 if LONG else 40)
+settings.register_profile(  # how fast examples are drawn says something of the computer, nothing of the product
+    "fixed", derandomize=True, database=None, max_examples=100 if LONG else 40, suppress_health_check=[HealthCheck.too_slow]
+)
 settings.load_profile("fixed")  # a test that fails must fail again: hypothesis draws the same examples in every run
 
 ROOT = Path(__file__).resolve().parents[1]
