@@ -41,14 +41,16 @@ def read_file(path: Path, columns: ColumnFile | None = None) -> Content:
     Raises
     ------
     FileFormatError
-        Its ending is not known, a table has no column file, or its content is wrong or incomplete; the message has the line.
+        The file is missing, its ending is not known, a table has no column file, or its content is wrong or incomplete; the message has
+        the line.
     """
     if is_table(path):
+        raw = read_bytes(path)
         if columns is None:
             raise FileFormatError(
                 f"{path.name}: what are the columns?", "give --columns FILE (docs/reference/instrument-files.md), or answer at a terminal"
             )
-        return read_table(path.name, read_bytes(path), columns)
+        return read_table(path.name, raw, columns)
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         known = ", ".join((*READERS, *TABLES))

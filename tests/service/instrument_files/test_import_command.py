@@ -132,7 +132,8 @@ def test_an_import_that_cannot_be_is_one_line(abbe: Abbe) -> None:
     assert "--axis is Y, the file says X" in abbe.fails("import", "x.rtl", "--yes", "--axis", "Y")
     assert "targets are closer than 0.1 mm" in abbe.fails("import", "fine.rtl", "--yes")
     assert "can be imported, and folders with campaign.json" in abbe.fails("import", "x.doc", "--yes")
-    assert "none.rtl: no such file" in abbe.fails("import", "none.rtl", "--yes")
+    for name in ("none.rtl", "none.csv"):
+        assert f"{name}: no such file" in abbe.fails("import", name, "--yes")
     assert not Path("abbe.sqlite3").exists()
 
 
