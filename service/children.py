@@ -6,6 +6,7 @@ Children therefore start with this file's absolute path and ``-P``: ``python -P 
 
 from __future__ import annotations
 
+import gc
 import os
 import runpy
 import sys
@@ -37,6 +38,7 @@ def started_safely() -> Iterator[None]:
 
 
 def _run() -> None:
+    gc.set_threshold(50_000)  # as in `abbe.service.cli.main`
     module, sys.argv[1:] = sys.argv[1], sys.argv[2:]
     if ROOT not in sys.path:
         sys.path.append(ROOT)  # last: needed only where Abbe runs from a folder and is not installed

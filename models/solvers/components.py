@@ -81,10 +81,12 @@ class InformationSums:
     def turned(self, root: F2, blocks: tuple[NDArray[np.intp], ...]) -> InformationSums:
         """The sums for new unknowns, where old = ``root`` @ new; ``root`` is the unit matrix outside ``blocks``."""
         gram = self.gram.copy()
-        for at in blocks:
-            gram[:, :, at] = gram[:, :, at] @ root[np.ix_(at, at)]
-        for at in blocks:
-            gram[:, at, :] = root[np.ix_(at, at)].T @ gram[:, at, :]
+        own = [root[np.ix_(at, at)] for at in blocks]
+        for one in (gram[k] for k in np.flatnonzero(self.count > 0)):
+            for at, turn in zip(blocks, own, strict=True):
+                one[:, at] = one[:, at] @ turn
+            for at, turn in zip(blocks, own, strict=True):
+                one[at] = turn.T @ one[at]
         return InformationSums(gram, self.rhs @ root, self.square, self.count)
 
     def decimated(self, factor: F1) -> InformationSums:
@@ -135,11 +137,12 @@ def sums(r: PlannedReadings, g: Grams, weight: F1) -> tuple[InformationSums, ...
 
 def total(parts: tuple[InformationSums, ...]) -> InformationSums:
     """Return the sums over all folds."""
+    first, *rest = parts
+    gram = first.gram.copy()
+    for s in rest:  # one after the other: together they would take as much memory again
+        gram += s.gram
     return InformationSums(
-        np.sum([s.gram for s in parts], axis=0),
-        np.sum([s.rhs for s in parts], axis=0),
-        np.sum([s.square for s in parts], axis=0),
-        np.sum([s.count for s in parts], axis=0),
+        gram, sum((s.rhs for s in rest), first.rhs), sum((s.square for s in rest), first.square), sum((s.count for s in rest), first.count)
     )
 
 
@@ -179,7 +182,7 @@ class ComponentPosterior:
 def blend(sums: InformationSums, c: Components, half: F1) -> tuple[F2, F1, float]:
     """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
     w = np.exp(-c.eta)
-    gram = np.tensordot(w, sums.gram, 1) * (half[:, None] * half)
+    gram = sum((w[k] * sums.gram[k] for k in np.flatnonzero(sums.count > 0)), np.zeros_like(sums.gram[0])) * (half[:, None] * half)
     return gram, (w @ sums.rhs) * half, float(w @ sums.square)
 
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 import scipy
@@ -26,7 +27,7 @@ OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
 """A reading this many standard deviations from the prediction of the rest of its run is left out; at most this fraction of a run."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Part:
     """One run without its outliers: whitened design, in units of the prior, and readings.
 
@@ -37,10 +38,15 @@ class Part:
     y: F1
     log_sigma: float
 
-    @property
+    @cached_property
     def information(self) -> F2:
         """Information of the run on the unknowns, shape (p, p), without their prior."""
         return np.asarray(self.a.T @ self.a)
+
+    @cached_property
+    def moment(self) -> F1:
+        """What the run says of the unknowns, shape (p,): transposed design times readings."""
+        return np.asarray(self.a.T @ self.y)
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,7 +63,7 @@ def together(parts: Sequence[Part]) -> Posterior:
     n = parts[0].a.shape[1]
     information = sum((p.information for p in parts), np.eye(n))
     lower = scipy.linalg.cholesky(information, lower=True)
-    half = scipy.linalg.solve_triangular(lower, sum((p.a.T @ p.y for p in parts), np.zeros(n)), lower=True)
+    half = scipy.linalg.solve_triangular(lower, sum((p.moment for p in parts), np.zeros(n)), lower=True)
     theta = scipy.linalg.solve_triangular(lower, half, lower=True, trans=1)
     left = sum(float(p.y @ p.y) for p in parts) - float(half @ half)
     log_p = -0.5 * left - float(np.log(np.diag(lower)).sum()) - sum(p.log_sigma for p in parts)
@@ -79,27 +85,40 @@ def conditional(others: Posterior, variants: dict[str, Part]) -> dict[str, float
     return out
 
 
-def scatter(a: F2, y: F1) -> tuple[float, NDArray[np.bool_]]:
+@dataclass(frozen=True)
+class Design:
+    """Design of one run, shape (n, p), in units of the prior."""
+
+    a: F2
+
+    @cached_property
+    def spectrum(self) -> tuple[F1, F2]:
+        """Eigenvalues (n,), none below 0, and eigenvectors (n, n) of the prior covariance of the run's readings."""
+        values, vectors = scipy.linalg.eigh(self.a @ self.a.T)
+        return np.clip(values, 0.0, None), vectors
+
+
+def scatter(design: Design, y: F1) -> tuple[float, NDArray[np.bool_]]:
     """Most probable noise of one run, mm, and which of its readings are outliers, bool, shape (n,).
 
     The noise is one of `SIGMA_GRID_MM`; each reading is compared with the prediction of all others of the run.
     """
     drop = np.zeros(y.size, dtype=bool)
     while True:
-        sigma, z = _against_the_rest(a[~drop], y[~drop])
+        sigma, z = _against_the_rest(Design(design.a[~drop]) if drop.any() else design, y[~drop])
         bad = np.abs(z) > OUTLIER_SIGMA
         if not bad.any() or drop.sum() + bad.sum() > OUTLIER_SHARE * drop.size:
             return sigma, drop
         drop[np.flatnonzero(~drop)[bad]] = True
 
 
-def _against_the_rest(a: F2, y: F1) -> tuple[float, F1]:
+def _against_the_rest(design: Design, y: F1) -> tuple[float, F1]:
     """Most probable noise, and every reading's distance from the prediction of the others in standard deviations.
 
     Source: Rasmussen and Williams, Gaussian Processes, eqs 5.8 and 5.12.
     """
-    values, vectors = scipy.linalg.eigh(a @ a.T)
-    values, turned = np.clip(values, 0.0, None), vectors.T @ y
+    values, vectors = design.spectrum
+    turned = vectors.T @ y
     spread = values[:, None] + SIGMA_GRID_MM**2
     log_p = -0.5 * (turned[:, None] ** 2 / spread + np.log(spread)).sum(axis=0)
     sigma = float(SIGMA_GRID_MM[int(np.argmax(log_p))])
@@ -188,8 +207,8 @@ class _Model:
     setup: SetupUnknowns
     scale: F1
 
-    def design(self, run: RunData) -> F2:
-        return run_design(self.machine, self.terms, _shortened(run), self.setup) * self.scale
+    def design(self, short: RunData) -> Design:
+        return Design(run_design(self.machine, self.terms, short, self.setup) * self.scale)
 
 
 def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG) -> tuple[SuspectRun, ...]:
@@ -246,18 +265,19 @@ def _without(undone: dict[str, Part], drop: NDArray[np.bool_]) -> dict[str, Part
 def _prepared(machine: Machine, runs: Sequence[RunData]) -> list[_Run]:
     """Every run without its outliers, whitened by the median noise of its instrument in this campaign."""
     model = _model(machine, runs)
-    designs = [model.design(r) for r in runs]
-    found = [scatter(a, _readings(r)) for a, r in zip(designs, runs, strict=True)]
+    short = [_shortened(r) for r in runs]
+    designs, readings = [model.design(r) for r in short], [_readings(r) for r in short]
+    found = [scatter(*given) for given in zip(designs, readings, strict=True)]
     usual = {
         kind: float(np.median([s for (s, _), r in zip(found, runs, strict=True) if r.kind == kind])) for kind in {r.kind for r in runs}
     }
     first = len(model.terms) + len(DIRECTIONS)
     out = []
-    for run, a, (_, drop) in zip(runs, designs, found, strict=True):
-        sigma = usual[run.kind]
-        undone = {name: _part(a, _readings(run, f), drop, sigma, f) for name, f in FACTORS.items()}
+    for run, a, y, (_, drop) in zip(runs, designs, readings, found, strict=True):
+        sigma, without = usual[run.kind], _readings(_shortened(replace(run, deviation_mm=np.zeros_like(run.deviation_mm))))
+        undone = {name: _part(a, without + f * (y - without), drop, sigma, f) for name, f in FACTORS.items()}
         undone |= {name: _part(model.design(r), _readings(r), drop, sigma) for name, r in _swapped(run).items()}
-        out.append(_Run(run.label, _part(a, _readings(run), drop, sigma), undone, sigma, first))
+        out.append(_Run(run.label, _part(a, y, drop, sigma), undone, sigma, first))
     return out
 
 
@@ -272,18 +292,17 @@ def _shortened(run: RunData) -> RunData:
     return block_average(run, BLOCKS) if run.kind == "bar" else run
 
 
-def _readings(run: RunData, factor: float = 1.0) -> F1:
-    """Readings minus nominal ones, with the deviations multiplied first; a wrong unit does not affect the nominal reading."""
-    short = _shortened(replace(run, deviation_mm=factor * run.deviation_mm))
+def _readings(short: RunData) -> F1:
+    """Readings minus nominal ones; without deviations, what a wrong unit does not affect."""
     return np.asarray(short.deviation_mm - nominal_reading(short))
 
 
-def _part(a: F2, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> Part:
+def _part(design: Design, y: F1, drop: NDArray[np.bool_], sigma: float, factor: float = 1.0) -> Part:
     """A whitened run; ``log_sigma`` accounts for the factor on the readings and spreads outliers evenly over `OUTLIER_MM`."""
     if np.abs(y).max() < LARGE_MM and abs(factor) != 1.0:
-        drop = scatter(a, y)[1]
+        drop = scatter(design, y)[1]
     log_sigma = float(np.log(np.where(drop, OUTLIER_MM, sigma)).sum() - y.size * np.log(abs(factor)))
-    return Part(a[~drop] / sigma, y[~drop] / sigma, log_sigma)
+    return Part(design.a[~drop] / sigma, y[~drop] / sigma, log_sigma)
 
 
 def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
@@ -319,7 +338,7 @@ def _noisier(part: Part, factor: float) -> Part:
 
 
 def _swapped(run: RunData) -> dict[str, RunData]:
-    """Variants of a ball-bar run with two axes exchanged whose positions still lie on the sphere; others are impossible anyway."""
+    """Shortened variants of a ball-bar run with two axes exchanged, where the positions still lie on the sphere."""
     if run.centre_mm is None or run.radius_mm is None:
         return {}
     out = {}
@@ -329,7 +348,7 @@ def _swapped(run: RunData) -> dict[str, RunData]:
         axes = run.axes_mm[:, order]
         off = np.abs(np.linalg.norm(axes - run.centre_mm, axis=1) - run.radius_mm).max()
         if off < ON_SPHERE_MM:
-            out[name] = replace(run, axes_mm=axes, sign=run.sign[:, order])
+            out[name] = _shortened(replace(run, axes_mm=axes, sign=run.sign[:, order]))
     return out
 
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
-from abbe.models.solvers.plausibility import Part, conditional, scatter, suspects, together
+from abbe.models.solvers.plausibility import Design, Part, conditional, scatter, suspects, together
 from tests.models.solvers.truth import MACHINE, Truth
 
 CONSTANT = 0.5 * np.log(2 * np.pi)
@@ -39,7 +39,7 @@ def test_scatter_finds_the_noise_and_the_outliers():
     a = np.polynomial.legendre.legvander(x, 6) * 5e-3
     y = a @ rng.normal(size=7) + rng.normal(0, 3e-4, 60)
     y[[5, 40]] += [8e-3, -20e-3]
-    sigma, drop = scatter(a, y)
+    sigma, drop = scatter(Design(a), y)
     assert sigma == pytest.approx(3e-4, rel=0.4)
     assert set(np.flatnonzero(drop)) == {5, 40}
 

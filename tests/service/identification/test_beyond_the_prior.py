@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import tarfile
 from pathlib import Path
 
@@ -11,6 +12,8 @@ import pytest
 import abbe
 from abbe.models.solvers.assessment import MapAgainstPrior
 
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
+
 
 def campaign(shared: Path, folder: Path, case: str) -> abbe.Campaign:
     with tarfile.open(shared / "data" / "coverage-practice.tar.xz") as tar:
@@ -19,7 +22,7 @@ def campaign(shared: Path, folder: Path, case: str) -> abbe.Campaign:
     return abbe.read_campaign(folder / "public" / case)
 
 
-@pytest.mark.parametrize("case", ["cusp01", "walk00"])
+@pytest.mark.parametrize("case", ["cusp01"] + ["walk00"] * LONG)
 def test_a_rough_machine_gets_a_map_that_stays_in_the_size_of_machines(shared: Path, tmp_path: Path, case: str) -> None:
     """Before motions had rough parts and bounded sizes, these maps reached millimetres."""
     rough = campaign(shared, tmp_path, case)
