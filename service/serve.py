@@ -103,7 +103,11 @@ class Service:
         context = OrderContext(setup.machine, lambda who: asyncio.to_thread(may, store, who, Permission.APPROVE), book, setup.control)
         if setup.campaign is not None:
             self._jobs.full = full_campaigns(
-                context, setup.campaigns, setup.campaign(store), lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE)
+                context,
+                setup.campaigns,
+                setup.campaign(store),
+                lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE),
+                alarms,
             )
         terms = LoopTerms(setup.maintenance, setup.ready(clock), follow_ups=alarms, run_job=self._jobs.run)
         self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)

@@ -181,11 +181,15 @@ class WebRequest:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class StartJob(WebRequest):
-    """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job."""
+    """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job.
+
+    ``alarm``: a full campaign looks for the cause of this alarm; 0: of none.
+    """
 
     kind: Literal["start"] = "start"
     recipe: Word
     key: Word
+    alarm: Number
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

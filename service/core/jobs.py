@@ -22,6 +22,7 @@ from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.schedule import Schedule
+from abbe.service.jobs.guided_campaign import is_full
 from abbe.service.scheduler.job import Job, carry_out
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
@@ -48,16 +49,23 @@ async def deny(_: str) -> bool:
     return False
 
 
+async def no_alarms(_: int) -> str:
+    """Know no alarm."""
+    return "this service raises no alarms"
+
+
 @dataclass(frozen=True, slots=True)
 class FullCampaigns:
-    """Full campaigns that a person may start: their names, and ``of(recipe, who)``, the job for a user (None: not a campaign).
+    """Full campaigns that a person may start: their names, and ``of(recipe, who, alarm)``, the job for a user (None: not a campaign).
 
-    ``may``: whether a user may propose tables, by the current table of users: a full campaign ends with this user's proposal.
+    ``may``: whether a user may propose tables, by the current table of users: a full campaign ends with this user's proposal;
+    ``against``: why the cause of an alarm cannot be searched, an empty text if it can.
     """
 
     names: tuple[str, ...] = ()
-    of: Callable[[str, str], Job[Any] | None] = lambda recipe, who: None
+    of: Callable[[str, str, int], Job[Any] | None] = lambda recipe, who, alarm: None
     may: Callable[[str], Awaitable[bool]] = deny
+    against: Callable[[int], Awaitable[str]] = no_alarms
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,19 +235,28 @@ class JobRegistry:
         refused = await self._refused(asked.who)
         if refused:
             return _answer(asked.request, "forbidden", refused)
-        campaign = self.full.of(asked.recipe, asked.who)
+        campaign = self.full.of(asked.recipe, asked.who, asked.alarm)
         if campaign is not None and not await self.full.may(asked.who):
             return _answer(asked.request, "forbidden", f"{asked.who} may not propose tables here, and {asked.recipe} ends with a proposal")
-        requested = JobRequest(asked.request, asked.who, asked.key, asked.recipe)
+        what = f"{asked.recipe} for alarm {asked.alarm}" if asked.alarm else asked.recipe
+        requested = JobRequest(asked.request, asked.who, asked.key, what)
         earlier = self.earlier_answer(requested)
         if earlier is not None:
             return earlier
+        if asked.alarm and (against := await self._against(asked)):
+            return _answer(asked.request, "conflict", against)
         if campaign is not None:
             return self.begin(requested, campaign)
         if split_recipe_name(asked.recipe)[0] not in self._recipes:
             there = ", ".join((*self._recipes, *self.full.names))
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")
         return self.begin(requested, self._checks(by_hand(asked.recipe), self._clock.utc()))
+
+    async def _against(self, asked: StartJob) -> str:
+        """Return why a job cannot look for the cause of an alarm; empty: it can."""
+        if not is_full(asked.recipe, self.full.names):
+            return f"{asked.recipe!r} does not find the cause of an alarm: start a full campaign"
+        return await self.full.against(asked.alarm)
 
     def earlier_answer(self, requested: JobRequest) -> Answer | None:
         """Return the earlier answer to this key; None: the key is new."""

@@ -21,12 +21,14 @@ from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import RollbackOrder, RollbackRequest
-from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand
+from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand, no_alarms
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, NotStored, TableRefused
 from abbe.service.jobs.guided_campaign import is_full
+from abbe.service.jobs.investigate import Note
+from abbe.service.scheduler.alarm_manager import AlarmManager
 from abbe.service.scheduler.job import Job, failure
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
@@ -34,6 +36,7 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, reconciled
 from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.verification.alarm_states import Alarm
 
 log = structlog.get_logger("abbe.orders")
 CAMPAIGN: Final = "campaign"
@@ -49,16 +52,20 @@ BY_ITSELF = "this service pushes approved proposals by itself ([alarm] push), or
 
 @dataclass(frozen=True, slots=True)
 class CampaignOrder:
-    """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it."""
+    """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it.
+
+    ``cause``: the alarm whose cause it looks for, and the function that writes its lines; None: of no alarm.
+    """
 
     recipe: str
     by: str
     progress: ProgressSink
     control: Control
+    cause: tuple[Alarm, Note] | None = None
 
 
 MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
-"""``await measure(order)``: measures, solves, proposes."""
+"""``await measure(order)``: measures, solves, proposes; for an alarm its lines tell the outcome."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,7 +156,11 @@ class _TableOrderJob(_OrderJob):
 
 
 def full_campaigns(
-    context: OrderContext, names: tuple[str, ...], measure: MeasureCampaign, may: Callable[[str], Awaitable[bool]]
+    context: OrderContext,
+    names: tuple[str, ...],
+    measure: MeasureCampaign,
+    may: Callable[[str], Awaitable[bool]],
+    alarms: AlarmManager | None = None,
 ) -> FullCampaigns:
     """Return the entry of full campaigns for the registry of jobs.
 
@@ -163,19 +174,29 @@ def full_campaigns(
         Measures, solves and proposes.
     may : callable
         ``await may(who)``: whether a user may propose tables.
+    alarms : AlarmManager, optional
+        The alarms whose cause a campaign can look for.
     """
 
-    def of(recipe: str, who: str) -> _OrderJob | None:
+    def of(recipe: str, who: str, alarm: int) -> _OrderJob | None:
         if not is_full(recipe, names):
             return None
 
         async def act(progress: ProgressSink, control: Control) -> JobOutcome:
-            return await measure(CampaignOrder(recipe, person(who), progress, control))
+            order = CampaignOrder(recipe, person(who), progress, control)
+            if not alarm or alarms is None:
+                return await measure(order)
 
-        begun = AuditEvent(who=who, action=CAMPAIGN, target=f"{context.machine}, {recipe}", outcome="begun", doc={})
+            async def look(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
+                await measure(replace(order, cause=(one, note)))
+
+            return await alarms.ordered(alarm, order.by, look, order.progress, order.control)
+
+        target = f"{context.machine}, {recipe}" + (f", alarm {alarm}" if alarm else "")
+        begun = AuditEvent(who=who, action=CAMPAIGN, target=target, outcome="begun", doc={})
         return _OrderJob(CAMPAIGN, recipe, _AuditTrail(context.audit, begun), act)
 
-    return FullCampaigns(names, of, may)
+    return FullCampaigns(names, of, may, no_alarms if alarms is None else alarms.against)
 
 
 class Orders(RetryingStore):

@@ -17,13 +17,14 @@ SILENT_AFTER = timedelta(seconds=3 * BEAT_S)
 
 
 class AlarmKind(StrEnum):
-    """Kind of an entry. The first five change the alarm itself, the others record the service's work on it."""
+    """Kind of an entry. The first five change the alarm itself, the others record the work on it; a person ``ordered`` some of it."""
 
     RAISED = "raised"
     CONTINUED = "held"
     ACKNOWLEDGED = "acknowledged"
     CLEARED = "cleared"
     SHELVED = "shelved"
+    ORDERED = "ordered"
     BEGUN = "begun"
     MEASURED = "measured"
     DISCOVERED = "discovered"

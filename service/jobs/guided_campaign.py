@@ -6,6 +6,7 @@ It never approves, and writes a table only to roll back an interrupted push.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
 from abbe.models.compensation.tables import Predicted
@@ -16,12 +17,14 @@ from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, make_proposal, promise_text
+from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, Note, investigate, make_proposal, plan_for, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
 from abbe.service.tables.nine_tables import read_base
+from abbe.service.verification.alarm_states import Alarm
 
 SOLVING = "the measurement is complete, and nothing moves while it is solved"
 
@@ -71,7 +74,26 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
         raise
 
 
-async def _measured(context: InvestigationContext, source: RecipeSource) -> None:
+async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note) -> None:
+    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both."""
+
+    async def measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
+        check_certificates(context.site)
+        _check_not_ended(context)
+        led = replace(context, plan=plan_for(context, alarm))
+        name = led.plan.name
+
+        async def begun() -> None:
+            await note(AlarmKind.BEGUN, AlarmFacts(text=f"measuring campaign {name!r}", campaign=name))
+
+        ids = await _measured(led, source, begun)
+        return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {name!r} is measured: {len(ids)} runs", campaign=name))
+
+    await investigate(context, alarm, note, measured)
+
+
+async def _measured(context: InvestigationContext, source: RecipeSource, begins: Callable[[], Awaitable[None]] | None = None) -> list[int]:
+    """Measure the plan; return the numbers of its runs. ``begins`` is called before anything moves, once the devices are checked."""
     site, store, name = context.site, context.store, context.plan.name
     plan = paced(context.plan, site.max_feed_mm_min)
     prompted = _PromptedPerson(context.control)
@@ -82,9 +104,13 @@ async def _measured(context: InvestigationContext, source: RecipeSource) -> None
             await check_devices(session, plan, air=site.watching.air_c is not None)
             await context.control.gate()
             await _check_table_acts(session)
+            if begins is not None:
+                await begins()
             begun = await start_campaign(session, store, site, name, artefacts_of(plan))
             try:
-                await measure(session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options)
+                return await measure(
+                    session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
+                )
             except BaseException as error:
                 error.add_note(
                     f"completed runs of campaign {name!r} are kept: `abbe measure -m MACHINE.toml --resume {name!r}` resumes, then "

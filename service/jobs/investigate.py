@@ -67,8 +67,14 @@ class InvestigationContext:
     live: LiveFeed | None = None
 
 
-async def investigate(context: InvestigationContext, alarm: Alarm, note: Note) -> None:
+Step = Callable[[InvestigationContext, Alarm, Note], Awaitable[Alarm]]
+"""``await step(context, alarm, note)``: does one step; returns the alarm with its lines."""
+
+
+async def investigate(context: InvestigationContext, alarm: Alarm, note: Note, measured: Step | None = None) -> None:
     """Take an alarm as far as possible: to a proposal that waits for approval, or to the reason why there is none.
+
+    ``measured``: measures the campaign in another way than unattended.
 
     Raises
     ------
@@ -83,7 +89,8 @@ async def investigate(context: InvestigationContext, alarm: Alarm, note: Note) -
     try:
         while (step := next_step(alarm)) is not None:
             await context.control.gate()
-            alarm = await _STEPS[step](context, alarm, note)
+            do = measured if measured is not None and step is AlarmKind.MEASURED else _STEPS[step]
+            alarm = await do(context, alarm, note)
     except REFUSALS as no:
         await note(AlarmKind.ENDED, AlarmFacts(text=f"no proposal: {no}", code=no.code))
 
@@ -93,7 +100,7 @@ async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> 
     if tries > TRIES:
         return await note(AlarmKind.ENDED, AlarmFacts(text=f"no proposal: {TRIES} tries to measure the full campaign were not completed"))
     again = "" if tries == 1 else " again: the last try was not completed"
-    plan = replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
+    plan = plan_for(context, alarm)
     site, options = context.site, MeasureOptions(control=context.control, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(context.store, site) as session:
@@ -102,6 +109,11 @@ async def _measured(context: InvestigationContext, alarm: Alarm, note: Note) -> 
             plan = paced(plan, site.max_feed_mm_min)
             ids = await measure(session, context.store, site, plan, progress=context.progress, clock=context.clock, options=options)
     return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {plan.name!r} is measured: {len(ids)} runs", campaign=plan.name))
+
+
+def plan_for(context: InvestigationContext, alarm: Alarm) -> CampaignPlan:
+    """Return the full campaign of an alarm, with a new name."""
+    return replace(context.plan, name=f"alarm {alarm.number} {context.clock.utc():%Y-%m-%d %H:%M:%S}")
 
 
 async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
@@ -163,7 +175,8 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
         check_promise(promised, context.site.limits)
         check_cause(promised, facts.against, facts.rms_um)
 
-    made = await make_proposal(context, _campaign(alarm), agree)
+    ordered = alarm.last(AlarmKind.ORDERED)
+    made = await make_proposal(context, _campaign(alarm), agree, "" if ordered is None else ordered.facts.name)
     if made.proposed.reasons:
         text = f"proposal {made.number} cannot be approved: {'; '.join(made.proposed.reasons)}"
         return await note(AlarmKind.ENDED, AlarmFacts(proposal=made.number, text=text))
@@ -216,7 +229,7 @@ def _campaign(alarm: Alarm) -> str:
     return measured.facts.campaign
 
 
-_STEPS: dict[AlarmKind, Callable[[InvestigationContext, Alarm, Note], Awaitable[Alarm]]] = {
+_STEPS: dict[AlarmKind, Step] = {
     AlarmKind.MEASURED: _measured,
     AlarmKind.DISCOVERED: _discovered,
     AlarmKind.PROPOSED: _proposed,

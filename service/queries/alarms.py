@@ -168,12 +168,12 @@ class _AlarmHistory:
     def _search(self, alarm: Alarm) -> DiscoverySummary | None:
         entry = alarm.last(AlarmKind.DISCOVERED)
         found = discoveries(self._reader, None, self._reader.machine, None, LATEST)[0]
-        return _of_alarm(found, alarm, None if entry is None else entry.facts.discovery)
+        return self._of_alarm(found, alarm, None if entry is None else entry.facts.discovery)
 
     def _proposal(self, alarm: Alarm) -> ProposalSummary | None:
         entry = alarm.last(AlarmKind.PROPOSED)
         found = proposals(self._reader, self._reader.machine, None, LATEST)[0]
-        return _of_alarm(found, alarm, None if entry is None else entry.facts.proposal)
+        return self._of_alarm(found, alarm, None if entry is None else entry.facts.proposal)
 
     def _push(self, proposal: ProposalSummary | None) -> PushSummary | None:
         if proposal is None:
@@ -193,9 +193,10 @@ class _AlarmHistory:
         ]
         return min(later, default=None)
 
-
-def _of_alarm(found: Sequence[Result], alarm: Alarm, known: int | None) -> Result | None:
-    """The result with the number that the alarm states; if it states none, the newest that came after the alarm."""
-    if known is not None:
-        return next((one for one in found if one.number == known), None)
-    return next((one for one in found if datetime.fromisoformat(one.created_utc) > alarm.raised_utc), None)
+    def _of_alarm(self, found: Sequence[Result], alarm: Alarm, known: int | None) -> Result | None:
+        """The result with the number that the alarm states; if it states none, the newest after the alarm and the last order to search."""
+        if known is not None:
+            return next((one for one in found if one.number == known), None)
+        ordered = alarm.last(AlarmKind.ORDERED)
+        since = alarm.raised_utc if ordered is None else datetime.fromisoformat(ordered.utc)
+        return next((one for one in found if datetime.fromisoformat(one.created_utc) > since), None)

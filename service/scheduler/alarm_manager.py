@@ -28,7 +28,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification import verify
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, next_step
-from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, check_facts, evaluate_alarm, last_seq
+from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, alarms_of, check_facts, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")
 
@@ -45,6 +45,10 @@ OUTCOME_TEXTS = {OPEN: "is open", STOPPED: "was stopped"}
 """Text for outcome words that make no sentence by themselves."""
 NOTHING_YET = JobOutcome("failed", "the service ended before anything was written")
 WAITS = "waits"
+
+
+Investigate = Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
+"""``await investigate(alarm, note, progress, control)``: takes an alarm to a proposal or to the reason why there is none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,7 +69,7 @@ class Duties:
 
     warn_days: float
     campaign: str
-    investigate: Callable[[Alarm, Note, ProgressSink, Control], Awaitable[None]]
+    investigate: Investigate
     push: Callable[[PushOrder], Awaitable[JobOutcome]] | None = None
 
 
@@ -206,8 +210,28 @@ class AlarmManager(RetryingStore):
             if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
                 needs = replace(schedule.needs, idle=True)  # wait while the machine works or another process uses it
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
-                return FollowUp(terms, _Investigation(self, one, terms))
+                return FollowUp(terms, _Investigation(self, one, terms, self.duties.investigate))
         return None
+
+    async def against(self, number: int) -> str:
+        """Return why the cause of an alarm cannot be searched now; an empty text if it can."""
+        known = await self._read(alarms_of, self._store, self._machine)
+        one = next((one for one in known if one.number == number), None)
+        if one is None:
+            return f"{self._machine} has no alarm {number}"
+        return "" if one.active else f"alarm {number} is over: the last check passed, and there is no cause to look for"
+
+    async def ordered(self, number: int, by: str, look: Investigate, progress: ProgressSink, control: Control) -> JobOutcome:
+        """Investigate an alarm because the user ``by`` asked for it: after its last line, or anew if it had ended.
+
+        Raises
+        ------
+        Exception
+            As `look` does; a line of the alarm tells it, unless another process has the machine.
+        """
+        alarm = await self.note(number, AlarmKind.ORDERED, AlarmFacts(name=by, text=f"{by} has started the search for the cause"))
+        terms = Schedule(f"investigation of alarm {number}", "", "UTC", self.duties.campaign)
+        return await _Investigation(self, alarm, terms, look).told(progress, control)
 
     def _schedule_of(self, one: Alarm) -> Schedule | None:
         """Return the schedule that raised an alarm; if it no longer exists, one of the same recipe."""
@@ -267,13 +291,23 @@ class _Investigation(_AlarmJob):
 
     kind = "investigation"
 
-    def __init__(self, manager: AlarmManager, alarm: Alarm, terms: Schedule) -> None:
+    def __init__(self, manager: AlarmManager, alarm: Alarm, terms: Schedule, look: Investigate) -> None:
         super().__init__(manager, terms)
-        self._alarm, self._last = alarm, JobOutcome("nothing", "")
+        self._alarm, self._look, self._last = alarm, look, JobOutcome("nothing", "")
 
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
-        await self._manager.duties.investigate(self._alarm, self._note, progress, control)
+        await self._look(self._alarm, self._note, progress, control)
         return self._last
+
+    async def told(self, progress: ProgressSink, control: Control) -> JobOutcome:
+        """Do the work as a part of another job; a line of the alarm tells of a failure."""
+        try:
+            return await self.work(progress, control)
+        except MachineInUse:
+            raise
+        except Exception as error:
+            await self.failed(error)
+            raise
 
     async def failed(self, error: Exception) -> JobOutcome:
         cause = verify.cause_of(error)
@@ -286,7 +320,7 @@ class _Investigation(_AlarmJob):
         await self.failed(error)
 
     async def _note(self, kind: AlarmKind, facts: AlarmFacts) -> Alarm:
-        self._last = JobOutcome(str(kind), facts.text)
+        self._last = JobOutcome(str(kind), facts.text, proposal=facts.proposal)
         return await self._manager.note(self._alarm.number, kind, facts)
 
 

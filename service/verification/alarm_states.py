@@ -16,6 +16,7 @@ from typing import Literal
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, Signal
 
 OF_WORK = (
+    AlarmKind.ORDERED,
     AlarmKind.BEGUN,
     AlarmKind.MEASURED,
     AlarmKind.DISCOVERED,
@@ -149,7 +150,8 @@ def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
     if kind is AlarmKind.SHELVED:
         return replace(alarm, shelved_until_utc=facts.until_utc)
     if kind in OF_WORK:
-        return replace(alarm, work=(*alarm.work, line))
+        anew = kind is AlarmKind.ORDERED and _has_ended(alarm)
+        return replace(alarm, work=(line,) if anew else (*alarm.work, line))
     if not alarm.active:
         return alarm
     alarm = replace(alarm, signals=facts.signals, text=facts.text, verification=facts.verification or 0, judged_seq=line.seq)
@@ -164,14 +166,20 @@ def is_open(alarm: Alarm) -> bool:
 def next_step(alarm: Alarm) -> AlarmKind | None:
     """Next step of the service in the investigation of an alarm; None: nothing to do now.
 
-    A failed step is retried once, after the next check that holds the alarm. An interrupted step resumes from its lines.
+    A failed step is retried once, after the next check that holds the alarm or when a person orders it. An interrupted step resumes from
+    its lines. An order after the end of the work begins it anew.
     """
-    if not alarm.active or alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None:
+    if not alarm.active or _has_ended(alarm):
         return None
     failed = alarm.last(AlarmKind.FAILED)
-    often = sum(s.kind is AlarmKind.FAILED for s in alarm.work) >= TRIES
-    if often or (failed is not None and alarm.work[-1] is failed and alarm.judged_seq < failed.seq):
+    if failed is not None and alarm.work[-1] is failed and alarm.judged_seq < failed.seq:
         return None
     if alarm.last(AlarmKind.DISCOVERED) is not None:
         return AlarmKind.PROPOSED
     return AlarmKind.DISCOVERED if alarm.last(AlarmKind.MEASURED) is not None else AlarmKind.MEASURED
+
+
+def _has_ended(alarm: Alarm) -> bool:
+    """Whether the investigation has an answer, or has failed too often."""
+    failures = sum(line.kind is AlarmKind.FAILED for line in alarm.work)
+    return failures >= TRIES or alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None

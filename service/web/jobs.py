@@ -52,19 +52,22 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         wanted: NewJob,
         key: Annotated[str, Header(alias="Idempotency-Key", max_length=100, description="A repeated key starts no second job")] = "",
     ) -> Response:
-        """Run a recipe now; ``identification``, the full campaign, ends with a proposal and also needs the permission ``propose``."""
+        """Run a recipe now; ``identification``, the full campaign, ends with a proposal and also needs the permission ``propose``.
+
+        With ``alarm`` the full campaign also looks for the cause of that alarm; what is measured or found already is not done again.
+        """
         visit: Visit = request.state.visit
         recipe = named(wanted.recipe, wanted.rate_hz)
-        visit.target = f"recipe {recipe}"
+        visit.target = f"recipe {recipe}" + (f", alarm {wanted.alarm}" if wanted.alarm else "")
         # The core knows the role of the user, but not the scopes of a token.
         if split_recipe_name(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
             return problem(
                 403, f"{recipe} ends with a proposal: it needs {Permission.PROPOSE.value!r} as well as {Permission.MEASURE.value!r}"
             )
-        answer = await core.start(recipe, key, visit.principal.name)
+        answer = await core.start(recipe, key, visit.principal.name, wanted.alarm)
         if answer.outcome == "unknown":
             return problem(422, answer.text)
-        visit.target = f"job {answer.job}, recipe {recipe}" if answer.job else visit.target
+        visit.target = f"job {answer.job}, {visit.target}" if answer.job else visit.target
         return answered(core, answer)
 
     @app.get("/api/v1/jobs/{job}", responses=REFUSALS)

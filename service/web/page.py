@@ -15,8 +15,8 @@ from markupsafe import Markup
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.alarms import PathStep
 from abbe.service.queries.status import Status
-from abbe.service.rendering.phrases import phrase, pictured
-from abbe.service.sequences.recipes.campaigns import IDENTIFICATION
+from abbe.service.rendering.phrases import is_whole, phrase, pictured
+from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, split_recipe_name
 from abbe.service.web import formatting, language
 from abbe.service.web.frame import current, template_functions
 from abbe.service.web.strip import strip_of
@@ -35,13 +35,24 @@ SCREENS = {
 }
 
 
-def step_address(step: PathStep, to_do: bool = False) -> str:
-    """Address of the result of a step, empty if there is none yet; with ``to_do``, of the screen on which a person does the step."""
-    if to_do and step.key in {"cause", "proposal", "proof"}:
-        return "/new?" + urlencode({"recipe": step.recipe or IDENTIFICATION})
+def step_address(step: PathStep, to_do_for: int | None = None) -> str:
+    """Address of the result of a step, empty if there is none yet.
+
+    ``to_do_for``: an alarm; then of the screen on which a person does the step.
+    """
+    if to_do_for is not None and step.key in {"cause", "proposal"}:
+        return search_address(to_do_for)
+    if to_do_for is not None and step.key == "proof":
+        recipe, rate_hz = split_recipe_name(step.recipe)
+        return "/new?" + urlencode({"recipe": recipe, "rate_hz": rate_hz})
     if step.number is None or (step.key == "report" and step.state != "now"):
         return ""
     return SCREENS[step.key].format(step.number)
+
+
+def search_address(alarm: int) -> str:
+    """Address of the screen on which a person starts the search for the cause of an alarm."""
+    return "/new?" + urlencode({"recipe": IDENTIFICATION, "alarm": alarm})
 
 
 HERE = Path(__file__).parent
@@ -86,7 +97,13 @@ def environment() -> Environment:
         "picture": lambda svg: pictured(current().lang, svg),  # our own SVG writer has escaped every text
         "say": lambda text: phrase(current().lang, str(text)),
     }
-    env.globals |= template_functions() | {"step_address": step_address, "has_uplot": has_uplot, "plot_files": plot_files}
+    env.tests["said"] = lambda text: is_whole(current().lang, str(text))
+    env.globals |= template_functions() | {
+        "step_address": step_address,
+        "search_address": search_address,
+        "has_uplot": has_uplot,
+        "plot_files": plot_files,
+    }
     return env
 
 

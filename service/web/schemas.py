@@ -18,6 +18,7 @@ from abbe.service.queries.results import DiscoverySummary, SolutionSummary
 from abbe.service.queries.tables import ProposalSummary
 from abbe.service.queries.timetable import ScheduleState
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
+from abbe.service.storage.repositories.pages import LARGEST
 from abbe.service.web.catalogue import ErrorEntry
 
 LONGEST_RECIPE = 180
@@ -151,6 +152,12 @@ class Me(ApiAnswer):
     csrf_token: str
 
 
+class StopToken(ApiAnswer):
+    """The value of the header ``X-CSRF-Token`` for a stop; empty for tokens."""
+
+    csrf_token: str
+
+
 class Decision(ApiAnswer):
     """A decision on a proposal. ``expiry``: end of an approval."""
 
@@ -189,6 +196,7 @@ class NewJob(RequestBody):
 
     recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
     rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
+    alarm: Annotated[int, Field(ge=0, le=LARGEST, description="A full campaign looks for the cause of this alarm; 0: of none")] = 0
 
 
 class ApproveBody(RequestBody):

@@ -223,7 +223,8 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
     ``folder``: folder of the recipe files.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.jobs.guided_campaign import named_now, run_guided_campaign
+    from abbe.service.domain.job_state import JobOutcome
+    from abbe.service.jobs.guided_campaign import investigate_guided, named_now, run_guided_campaign
     from abbe.service.jobs.investigate import InvestigationContext
     from abbe.service.sequences.recipes.campaigns import campaign_source
 
@@ -231,8 +232,11 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
         async def measure(order: CampaignOrder) -> JobOutcome:
             source = campaign_source(order.recipe, folder)
             plan = source.plan(site.machine)
-            context = named_now(InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live), order.recipe)
-            return await run_guided_campaign(context, source, order.by)
+            context = InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live)
+            if order.cause is None:
+                return await run_guided_campaign(named_now(context, order.recipe), source, order.by)
+            await investigate_guided(context, source, *order.cause)
+            return JobOutcome("done", "")
 
         return measure
 

@@ -156,10 +156,13 @@ class CoreLine:
 
     # ---- requests to the core ---------------------------------------------------------------------------------------
 
-    async def start(self, recipe: str, key: str, who: str) -> Answer:
-        """Start a job. Raises CoreUnavailable if no answer comes: then the outcome is unknown; repeat the request with the same key."""
+    async def start(self, recipe: str, key: str, who: str, alarm: int = 0) -> Answer:
+        """Start a job; ``alarm``: a full campaign looks for its cause. Raises CoreUnavailable if no answer comes.
+
+        Then the outcome is unknown: repeat the request with the same key.
+        """
         number = next(self._numbers)
-        return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who))
+        return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who, alarm=alarm))
 
     async def steer(self, job: str, how: Steering, who: str) -> Answer:
         """Stop, abort, pause or resume a running job. Raises CoreUnavailable if no answer comes."""

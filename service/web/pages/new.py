@@ -19,7 +19,7 @@ from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.context import PageContext, can_be_stored
+from abbe.service.web.pages.context import Number, PageContext, can_be_stored
 from abbe.service.web.pages.last_good import NO_SHAPE, last_good_shape
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
@@ -29,11 +29,14 @@ Rate = Annotated[int, Query(ge=1, le=1000)]
 
 
 def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
-    """Add the screen of a new measurement to the application. ``plans``: recipes that can be rehearsed."""
+    """Add the screen of a new measurement to the application. ``plans``: recipes that can be rehearsed.
+
+    For an ``alarm`` the full campaign also looks for its cause.
+    """
 
     @app.get("/new", include_in_schema=False)
     @needs(Permission.READ)
-    async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ) -> HTMLResponse:
+    async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ, alarm: Number = None) -> HTMLResponse:
         status = await context.source.status()
         rate_hz = rate_hz if rate_hz in plans.rates_hz else USUAL_HZ
         choices = plans.choices()
@@ -48,6 +51,7 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
             rate_hz=rate_hz,
             dry=dry,
             guided=chosen == CAMPAIGN,
+            alarm=(alarm or 0) if chosen == CAMPAIGN else 0,
             max_feed=None if plans.machine is None else plans.machine.max_feed_mm_min,
             may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
             may_propose=current().may(Permission.PROPOSE),

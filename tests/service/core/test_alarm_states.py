@@ -189,3 +189,28 @@ def test_an_ended_investigation_is_not_begun_again(raised: Book) -> None:
     raised.add(1, AlarmKind.ENDED, text="no proposal: not enough to write")
     raised.check(BAD)
     assert next_step(raised.alarms[0]) is None
+
+
+def test_an_order_goes_on_after_the_last_line_and_begins_anew_after_an_end() -> None:
+    book = Book()
+    book.check(BAD)
+    for kind in (AlarmKind.ORDERED, AlarmKind.BEGUN, AlarmKind.MEASURED):
+        book.add(1, kind)
+    book.add(1, AlarmKind.FAILED)
+    assert next_step(book.alarms[0]) is None, "no check has held the alarm since the failure"
+    book.add(1, AlarmKind.ORDERED, name="petra")
+    assert next_step(book.alarms[0]) is AlarmKind.DISCOVERED, "what is measured is not measured again"
+    book.add(1, AlarmKind.DISCOVERED)
+    book.add(1, AlarmKind.ENDED)
+    assert next_step(book.alarms[0]) is None
+    book.add(1, AlarmKind.ORDERED, name="petra")
+    (alarm,) = book.alarms
+    assert next_step(alarm) is AlarmKind.MEASURED
+    assert [line.kind for line in alarm.work] == [AlarmKind.ORDERED]
+    for _ in range(2):
+        book.add(1, AlarmKind.BEGUN)
+        book.add(1, AlarmKind.FAILED)
+        book.check(BAD)
+    assert next_step(book.alarms[0]) is None, "it has failed too often"
+    book.add(1, AlarmKind.ORDERED, name="petra")
+    assert next_step(book.alarms[0]) is AlarmKind.MEASURED

@@ -82,7 +82,7 @@ class Bench:
         return self.end
 
     async def start(self, recipe: str = "identification", key: str = "", who: str = "token:bob/ci") -> Answer:
-        answer = await self.book.start(StartJob(request=1, recipe=recipe, key=key, who=who))
+        answer = await self.book.start(StartJob(request=1, recipe=recipe, key=key, who=who, alarm=0))
         if answer.outcome == "done":
             await self.until(lambda: self.book.latest()[0].prompt or self.book.latest()[0].ended_utc is not None)
         return answer

@@ -22,13 +22,18 @@ from abbe.service.campaigns.campaign_run import plan_hash
 from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
+from abbe.service.jobs import investigate
+from abbe.service.jobs.investigate import InvestigationContext
 from abbe.service.sequences.control import Control, State, Watching
 from abbe.service.sequences.recipes.campaigns import RecipeSource, campaign_source
 from abbe.service.sequences.recipes.recipe import Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.sequences.steps import CampaignPlan
+from abbe.service.verification.alarm_states import Alarm, folded
 from tests.pretended_status import controller_status
 from tests.service.core.fakes import settle
 from tests.service.web.pages.test_rehearsal import MACHINE
@@ -191,3 +196,46 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         await asyncio.wait({asking}, timeout=10)
         assert control.prompts.now is None
         assert isinstance(asking.exception(), Stopped) == (number == 2)
+
+
+class Lines:
+    """An alarm and its lines, without a store."""
+
+    def __init__(self) -> None:
+        self.lines: list[AlarmEntryRecord] = []
+
+    async def note(self, kind: AlarmKind, facts: AlarmFacts) -> Alarm:
+        line = AlarmEntryRecord(machine="mill-7", alarm=1, seq=len(self.lines), kind=kind, facts=facts, utc="2026-11-22T00:00:00Z")
+        self.lines.append(line)
+        return folded(self.lines)[0]
+
+
+async def test_the_cause_of_an_alarm_is_measured_with_a_person_and_its_lines_come_in_order(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = Lines()
+    await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
+    alarm = await lines.note(AlarmKind.ORDERED, AlarmFacts(name="petra"))
+
+    async def led(context: Any, source: Any, begins: Any) -> list[int]:
+        assert [line.kind for line in lines.lines] == ["raised", "ordered"], "nothing has begun before the devices are checked"
+        await begins()
+        assert (lines.lines[-1].kind, context.plan.name) == ("begun", lines.lines[-1].facts.campaign)
+        return [7, 8]
+
+    async def nothing_found(context: Any, alarm: Alarm, note: Any) -> Alarm:
+        raise NotObservable("scale of X")
+
+    monkeypatch.setattr(work, "_measured", led)
+    monkeypatch.setitem(investigate._STEPS, AlarmKind.DISCOVERED, nothing_found)
+    bench: Any = InvestigationContext(pretended().site, None, CampaignPlan("", ()), SystemClock(), ignore_progress)  # type: ignore[arg-type]
+    await work.investigate_guided(bench, {}, alarm, lines.note)  # type: ignore[arg-type]
+    assert [line.kind for line in lines.lines[2:]] == ["begun", "measured", "ended"]
+    assert lines.lines[3].facts.text.endswith("is measured: 2 runs")
+
+
+async def test_without_certificates_no_cause_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    lines = Lines()
+    alarm = await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
+    bench: Any = InvestigationContext(pretended(calibrated_until={}).site, None, CampaignPlan("", ()), SystemClock(), ignore_progress)  # type: ignore[arg-type]
+    await work.investigate_guided(bench, {}, alarm, lines.note)  # type: ignore[arg-type]
+    assert (lines.lines[-1].kind, "no calibration certificate" in lines.lines[-1].facts.text) == ("ended", True)

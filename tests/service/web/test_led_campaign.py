@@ -157,9 +157,25 @@ async def test_it_is_started_from_the_checklist(desk: Desk, plant: Plant) -> Non
     assert shown.count('type="checkbox"') == 4, "nineteen set-ups are told, not ticked off beforehand"
     assert len(re.findall(r"<li>(Bar|Laser)", shown)) == 19
     assert 'id="start"' not in await desk.page(f"/new?recipe={CAMPAIGN}", plant.session("viewer"))
+    assert 'data-alarm="0"' in shown
     sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": 500}, headers=who | {"Idempotency-Key": "k"})
     assert sent.status_code == 202
-    assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=f"{CAMPAIGN} at 500 Hz", key="k", who="user:a-metrologist")
+    assert desk.asked[-1] == StartJob(
+        request=desk.asked[-1].request, recipe=f"{CAMPAIGN} at 500 Hz", key="k", who="user:a-metrologist", alarm=0
+    )
+
+
+async def test_the_cause_of_an_alarm_is_searched_from_the_same_checklist(desk: Desk, plant: Plant) -> None:
+    who = plant.session("metrologist")
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    shown = await desk.page(f"/new?recipe={CAMPAIGN}&alarm=3", who)
+    assert 'data-alarm="3"' in shown
+    assert "looks for the cause of alarm 3" in shown
+    assert 'data-alarm="0"' in await desk.page("/new?recipe=quick-check&alarm=3", who), "a check finds no cause"
+    sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "alarm": 3}, headers=who)
+    assert sent.status_code == 202
+    assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=CAMPAIGN, key="", who="user:a-metrologist", alarm=3)
+    assert plant.store.audit.events(1)[0].target == f"job {NUMBER}, recipe {CAMPAIGN}, alarm 3"
 
 
 async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) -> None:

@@ -196,7 +196,15 @@ def test_a_dry_run() -> None:
     assert dry is not None
     told = SimpleNamespace(job=None, next_due=[])
     known = {"bar": strip_of(None), "choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
-    known |= {"max_feed": TOLD.max_feed_mm_min, "may_measure": True, "guided": False, "key": "k", "expired": [], "temperature_c": None}
+    known |= {
+        "max_feed": TOLD.max_feed_mm_min,
+        "may_measure": True,
+        "guided": False,
+        "alarm": 0,
+        "key": "k",
+        "expired": [],
+        "temperature_c": None,
+    }
     page = html.unescape(environment().get_template("new.html").render(machine="m", zone="UTC", status=told, dry=dry, **known))
     assert f"{dry.fastest_mm_min / IN:.2f} in/min (Limit {6000 / IN:.2f})" in page
     for _, low, high, least, most in dry.used:
@@ -231,7 +239,7 @@ def test_a_dry_run() -> None:
 def test_a_live_run_gives_its_script_the_unit() -> None:
     now = datetime(2026, 11, 22, 6, tzinfo=UTC)
     job = RunningCheck(id="0123456789ab", schedule="", recipe="quick-check", since_utc=now)
-    moment = SimpleNamespace(job=job, next_due=[], now_utc=now)
+    moment = SimpleNamespace(job=job, next_due=[], alarms=(), now_utc=now)
     words = script_texts("en")
     screen = environment().get_template("live.html")
     page = html.unescape(screen.render(bar=strip_of(None), machine="m", zone="UTC", status=moment, may_measure=True, texts=words))
