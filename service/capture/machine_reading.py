@@ -15,6 +15,8 @@ SHORTEST_S = 0.2
 """Shortest time between two positions from which a feed is computed, s."""
 OLD_S = 5.0
 """An answer that is older, s, is not shown."""
+MOST_PERCENT = 1000.0
+"""Largest override that is believed, %."""
 MM_PER_COUNT = 1e-7
 MM_MIN_PER_MM_US = 6e7
 
@@ -44,7 +46,7 @@ class LatestReading:
             at_ms=self._utc_ms("controller", status.host_s),
             position_mm=status.position_mm,
             feed_mm_min=self._feed_mm_min if status.moving else 0.0,
-            override_percent=status.override_percent,
+            override_percent=_percent(status.override_percent),
             door_open=Condition.DOOR_OPEN in status.conditions,
             air_c=None if laser is None else _finite(laser.air_temp_c),
             laser_at_ms=None if laser is None else self._utc_ms("laser", laser.host_s),
@@ -69,6 +71,11 @@ class LatestReading:
             way_mm = math.dist(status.position_mm, before.position_mm)
             self._feed_mm_min = _finite(way_mm / (status.ctrl_us - before.ctrl_us) * MM_MIN_PER_MM_US)
         self._before = status
+
+
+def _percent(value: float) -> int | None:
+    """The override as a whole percentage; None if a control tells one that cannot be: it is not known then."""
+    return round(value) if math.isfinite(value) and 0.0 <= value <= MOST_PERCENT else None
 
 
 def _finite(value: float) -> float | None:

@@ -88,7 +88,7 @@ class MachineReading:
     at_ms: float
     position_mm: tuple[float, float, float]
     feed_mm_min: float | None
-    override_percent: Number
+    override_percent: Number | None
     door_open: bool
     air_c: float | None
     laser_at_ms: float | None

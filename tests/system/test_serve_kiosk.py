@@ -7,16 +7,22 @@ import re
 import socket
 import threading
 import time
+from contextlib import closing
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 import pytest
 from playwright.sync_api import Browser, Error, Page, Route
 
+from abbe.service.clock import SystemClock
+from abbe.service.storage.store import Store
+from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.web.page import HERE
-from tests.pages_world import filled_once, served
+from tests.pages_world import PHRASE, filled_once, served
 from tests.patience import within
+from tests.system.serve_bench import Process, free_port, service
 from tests.system.test_serve_page import ARTIFACTS
 from tests.system.test_serve_screens import INSIDE, SMALL, axe, context, log_in, violations
 
@@ -105,6 +111,9 @@ def test_a_server_that_never_answers_leaves_the_kept_page_grey_and_stop_works_as
         pressed: list[str] = []
 
         def stopped(route: Route) -> None:
+            if route.request.method == "GET":
+                route.continue_()
+                return
             pressed.append(route.request.headers["x-csrf-token"])
             route.fulfill(status=200, json={})
 
@@ -116,6 +125,45 @@ def test_a_server_that_never_answers_leaves_the_kept_page_grey_and_stop_works_as
             assert re.fullmatch(r"[0-9a-f]{64}", pressed[0]), "the token is that of the session"
             page.unroute("**/api/v1/status")
             page.wait_for_selector("html:not([data-kept])[data-ready=yes]", timeout=1e3 * within(30))
+
+
+def stopped_at_the_page(page: Page, running: Process) -> None:
+    """Stop is pressed and says so, and the axes are held."""
+    page.click("#stop")
+    page.wait_for_selector("#stop-answer:has-text('Stopping')", timeout=1e3 * within(20))
+    running.expect("held")
+
+
+def test_stop_works_after_the_log_in_ran_out_on_a_page_that_stayed_open_and_on_a_kept_one(chromium: Browser, tmp_path: Path) -> None:
+    """A real core that measures; hours go by in the table of sessions."""
+    url, port = f"sqlite:///{tmp_path / 'abbe.sqlite3'}", free_port()
+    base = f"http://127.0.0.1:{port}"
+    with Store.open(url) as store:
+        UserAccounts(store, SystemClock(), Passwords(memory_kib=64, passes=1)).add("olga", "operator", PHRASE)
+        with context(chromium, "1024") as made:
+            page = made.new_page()
+            with closing(service(tmp_path, schedules=[["endless", "* * * * * *", "endless"]], port=port)) as running:
+                running.expect('"page up"')
+                kept(page, base)
+                with store.engine.begin() as connection:
+                    connection.exec_driver_sql("UPDATE sessions SET seen_utc = '2026-01-01T00:00:00.000000Z'")
+                page.wait_for_selector("#lost a[href='/login']", timeout=1e3 * within(20))
+                assert urlsplit(page.url).path == "/", "the screen with Stop stays"
+                assert "grayscale" in page.evaluate(GREY)
+                stopped_at_the_page(page, running)
+                running.terminate()
+            page.goto(f"{base}/")
+            page.wait_for_selector("html[data-kept][data-ready=yes]")
+            with closing(service(tmp_path, schedules=[["endless", "* * * * * *", "endless"]], port=port)) as running:
+                running.expect('"page up"')
+                page.wait_for_selector("#lost a[href='/login']", timeout=1e3 * within(20))
+                assert page.locator("html[data-kept]").count() == 1
+                stopped_at_the_page(page, running)
+                with store.engine.begin() as connection:
+                    connection.exec_driver_sql("UPDATE sessions SET ended_utc = seen_utc")
+                page.wait_for_url("**/login", timeout=1e3 * within(20))  # logged out elsewhere: nothing is left that could stop
+        done = [(r.who, r.outcome) for r in store.audit.events(1000) if r.action == "POST /api/v1/stop"]
+        assert done == [("user:olga", "done 202")] * 2
 
 
 def test_a_kept_state_ends_after_twelve_hours(chromium: Browser, tmp_path_factory: pytest.TempPathFactory) -> None:

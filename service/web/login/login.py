@@ -24,7 +24,7 @@ from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.authentication import Authenticator, csrf_token
 from abbe.service.web.login.origin import is_tls
 from abbe.service.web.problems import problem
-from abbe.service.web.schemas import AuditList, Me, Problem, UserList
+from abbe.service.web.schemas import AuditList, Me, Problem, StopToken, UserList
 
 LONGEST_FORM = 4096
 
@@ -141,6 +141,13 @@ def _add_reading(app: FastAPI, auth: Authenticator) -> None:
         who = visit.principal
         token = csrf_token(visit.secret) if visit.secret else ""
         return Me(name=who.name, role=who.role or "", permissions=sorted(who.permissions), csrf_token=token)
+
+    @app.get("/api/v1/stop", responses=refusals)
+    @needs(Permission.STOP)
+    async def stop_token(request: Request) -> StopToken:
+        """The token with which this browser may stop the machine. A session that has run out is enough, as for the stop itself."""
+        visit: Visit = request.state.visit
+        return StopToken(csrf_token=csrf_token(visit.secret) if visit.secret else "")
 
     @app.get("/api/v1/users", responses=refusals)
     @needs(Permission.USERS)

@@ -40,7 +40,7 @@ export class Machine {
     if (reading === null) return;
     for (const [k, axis] of ["x", "y", "z"].entries()) setText(`dro-${axis}`, (reading.position_mm[k] / this.mm).toFixed(3 + this.finer));
     const feed = reading.feed_mm_min === null ? "–" : (reading.feed_mm_min / this.mm).toFixed(this.finer);
-    setText("dro-feed", reading.override_percent === 100 ? feed : `${feed} (${reading.override_percent} %)`);
+    setText("dro-feed", reading.override_percent === 100 ? feed : `${feed} (${reading.override_percent ?? "–"} %)`);
     setText("dro-door", this.words[reading.door_open ? "live.door.open" : "live.door.shut"]);
     find("dro-door").classList.toggle("fail", reading.door_open);
     setText("dro-air", reading.air_c === null ? "–" : `${reading.air_c.toFixed(1)} °C`);

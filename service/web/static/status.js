@@ -75,10 +75,10 @@ async function showBar(status) {
   shownBar = next;
 }
 
-// A kept page has no token: it asks for that of the session first. Null: the service cannot be reached.
+// A kept page has no token: it asks for that of the session first, which may have run out. Null: the service cannot be reached.
 async function stopAnswer(button) {
   if (!button.dataset.csrf) {
-    const session = await ask("/api/v1/session", true);
+    const session = await ask("/api/v1/stop", true);
     if (!session.ok) return session;
     button.dataset.csrf = (await session.json()).csrf_token;
   }
@@ -129,7 +129,12 @@ function connected(yes, silent = false) {
   document.body.classList.toggle("stale", !yes);
 }
 
+// The log-in has run out: the screen is grey until somebody logs in, and its Stop still works.
+let out = false;
+
 function loggedOut() {
+  if (out) return;
+  out = true;
   connected(false);
   const link = document.createElement("a");
   link.href = "/login";
@@ -144,11 +149,12 @@ async function refresh() {
     touched = false;
     const answer = await ask("/api/v1/status", active);
     if (answer.status === 401) {
-      // While the machine is being measured the screen stays, since its Stop still works.
-      if (!document.querySelector("#machine-bar .busy")) location.assign("/login");
-      loggedOut();
+      if ((await ask("/api/v1/stop", false)).ok) loggedOut();
+      else location.assign("/login");
+      setTimeout(refresh, PERIOD_MS);
       return;
     }
+    if (out && answer.ok) { location.reload(); return; }
     if (!answer.ok) {
       silent = answer.status === 503 && (await answer.json()).code === "SRV-002";
       throw new Error(`status ${answer.status}`);

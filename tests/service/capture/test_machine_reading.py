@@ -10,6 +10,7 @@ import pytest
 
 from abbe.drivers.api import Condition, Controller, ControllerStatus, DisplacementMeter, LaserFlag, LaserReading
 from abbe.service.capture.machine_reading import LatestReading
+from abbe.service.channel.messages import LiveMachine, encode, from_core
 from abbe.service.clock import SystemClock
 from abbe.service.devices.session import Session, noted, noted_meter
 
@@ -101,6 +102,31 @@ def test_every_answer_keeps_its_own_time() -> None:
     assert second is not None
     assert second.laser_at_ms == first.laser_at_ms
     assert second.at_ms != first.at_ms
+
+
+@pytest.mark.parametrize(
+    ("told_percent", "known"),
+    [
+        (0, 0),
+        (80, 80),
+        (79.6, 80),
+        (1000, 1000),
+        (-1, None),
+        (1001, None),
+        (float("nan"), None),
+        (float("inf"), None),
+        (float("-inf"), None),
+    ],
+)
+def test_an_override_that_cannot_be_is_not_known(told_percent: Any, known: int | None) -> None:
+    """A driver of somebody else may tell anything; the channel to the page takes what comes out of here."""
+    cnc, _, session, reading = told()
+    cnc.answer = replace(STATUS, override_percent=told_percent)
+    asyncio.run(session.controller.status())
+    now = reading()
+    assert now is not None
+    assert now.override_percent == known
+    assert from_core(encode(LiveMachine("machine", now))) == LiveMachine("machine", now)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf"), float("-inf")])
