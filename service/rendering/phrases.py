@@ -80,6 +80,17 @@ def phrase(lang: str, text: str) -> str:
     return text
 
 
+def is_whole(lang: str, text: str) -> bool:
+    """Whether a language has phrases for all parts of a text, so that `phrase` leaves nothing English."""
+    if lang == ENGLISH or not _WORD.search(text):
+        return True
+    bare = text.removesuffix(".")
+    if (_fitting(lang, bare) or _within_a_sentence(lang, bare)) is not None:
+        return True
+    parts = next((parts for end in _ENDS if len(parts := text.split(end)) > 1), [])
+    return bool(parts) and all(is_whole(lang, part) for part in parts)
+
+
 def _fitting(lang: str, text: str) -> str | None:
     exact, patterns = _phrases(lang)
     if text in exact:

@@ -15,11 +15,12 @@ from jinja2 import Environment
 from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.errors import AbbeError, CoreUnavailable
+from abbe.service.domain.document import Doc
+from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.status import Status
 from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current, frame_for
-from abbe.service.web.problems import MEDIA_TYPE, problem_of
+from abbe.service.web.problems import MEDIA_TYPE, problem, problem_of
 from abbe.service.web.strip import strip_of
 
 RETRY_S = "5"
@@ -33,7 +34,9 @@ def add_core_unavailable(app: FastAPI, env: Environment) -> None:
         if not for_people(request):
             return problem_of(error)
         return HTMLResponse(
-            env.get_template("core_unavailable.html").render(text=str(error), bar=strip_of(None)), 503, {"Retry-After": RETRY_S}
+            env.get_template("core_unavailable.html").render(texts=filter(None, (error.detail, error.remedy)), bar=strip_of(None)),
+            503,
+            {"Retry-After": RETRY_S},
         )
 
     app.add_exception_handler(CoreUnavailable, silent)
@@ -42,7 +45,7 @@ def add_core_unavailable(app: FastAPI, env: Environment) -> None:
 def for_people(request: Request) -> bool:
     """Whether the request is for a screen. The home page always is: its script fetches it without an Accept header."""
     path = request.url.path
-    return path == "/" or (not path.startswith("/api/") and "text/html" in request.headers.get("accept", ""))
+    return path == "/" or "text/html" in request.headers.get("accept", "")
 
 
 class ErrorPages:
@@ -56,37 +59,49 @@ class ErrorPages:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Pass the request on; replace a problem document by a screen."""
-        if scope["type"] != "http" or scope["path"].startswith("/api/") or not _reads_html(scope):
+        if scope["type"] != "http" or not _reads_html(scope):
             await self._app(scope, receive, send)
             return
         start: list[Message] = []
         body: list[bytes] = []
 
         async def replaced(message: Message) -> None:
-            if message["type"] == "http.response.start" and (b"content-type", MEDIA_TYPE.encode()) in message["headers"]:
+            if message["type"] == "http.response.start" and message["status"] >= 400 and not _is_screen(message):
                 start.append(message)
             elif not start:
                 await send(message)
             else:
                 body.append(message.get("body", b""))
                 if not message.get("more_body", False):
-                    await self._page(scope, start[0], json.loads(b"".join(body)))(scope, receive, send)
+                    await self._page(scope, start[0], _problem_in(start[0], b"".join(body)))(scope, receive, send)
 
         await self._app(scope, receive, replaced)
 
-    def _page(self, scope: Scope, start: Message, problem: dict[str, str]) -> ASGIApp:
+    def _page(self, scope: Scope, start: Message, told: Doc) -> ASGIApp:
         kept = {k.decode(): v.decode() for k, v in start["headers"] if k not in {b"content-type", b"content-length"}}
 
         async def answer(_: Scope, receive: Receive, send: Send) -> None:
             request, now = HTTPConnection(scope), None
             with frame_for(request):
                 if current().may(Permission.READ):
-                    with suppress(AbbeError):
+                    with suppress(Exception):  # whatever is broken: the screen with the first error is shown
                         now = await self._status()
-                page = self._env.get_template("error.html").render(problem=problem, bar=strip_of(now))
+                page = self._env.get_template("error.html").render(problem=told, bar=strip_of(now))
             await HTMLResponse(page, int(start["status"]), kept)(scope, receive, send)
 
         return answer
+
+
+def _is_screen(start: Message) -> bool:
+    return any(name == b"content-type" and value.startswith(b"text/html") for name, value in start["headers"])
+
+
+def _problem_in(start: Message, body: bytes) -> Doc:
+    """The problem document of a response; that of its text if a layer below us has answered with text."""
+    given = dict(start["headers"]).get(b"content-type", b"") == MEDIA_TYPE.encode()
+    text = bytes(body if given else problem(int(start["status"]), body.decode("utf-8", "replace")).body)
+    found: Doc = json.loads(text)
+    return found
 
 
 def _reads_html(scope: Scope) -> bool:
