@@ -137,8 +137,11 @@ BarSamples = npt.NDArray[np.void]
 
 def _holds(samples: BarSamples, what: Callable[[int], bool]) -> npt.NDArray[np.bool_]:
     """Mask of the samples for whose status something holds; a run has few different ones."""
-    kinds, which = np.unique(samples["status"], return_inverse=True)
-    return np.array([what(int(kind)) for kind in kinds], dtype=np.bool_)[which]
+    status = np.ascontiguousarray(samples["status"])
+    holds = np.zeros(2**16, dtype=np.bool_)
+    for kind in np.flatnonzero(np.bincount(status)):
+        holds[kind] = what(int(kind))
+    return np.asarray(holds[status], dtype=np.bool_)
 
 
 def _follows(samples: BarSamples, k: int) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
@@ -11,6 +12,7 @@ from abbe.service.domain.document import Doc
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
+from abbe.service.web.pages.runs import readings_of
 
 NOTHING: Doc = {"x": [], "low": [], "high": [], "whole": [0.0, 0.0], "readings": 0}
 PARTS = 1000
@@ -34,24 +36,46 @@ def envelope(x: F1, y: F1, low: float, high: float) -> tuple[F1, F1, F1]:
 
 def run_curve(store: Store, number: int, low: float, high: float) -> Doc:
     """Deviation in the reader's unit against time, as read. Raises NotStored, StoreError, MeasurementFault."""
-    t_s, deviation_mm = _readings(store, number)
-    unit = current().drawn()
-    if not len(t_s):  # sealed: its readings are not here
+    samples = readings_of(store, number)
+    shown = _overview(store, number, samples)
+    if not shown.readings:  # sealed: its readings are not here
         return NOTHING
-    x, least, largest = envelope(t_s, deviation_mm, max(low, float(t_s[0])), min(high, float(t_s[-1])))
-    scale = 1e3 / unit.size
+    x, least, largest = shown.drawn
+    if low > shown.whole[0] or high < shown.whole[1]:
+        t_s, deviation_mm = _readings(store, number, samples)
+        x, least, largest = envelope(t_s, deviation_mm, max(low, shown.whole[0]), min(high, shown.whole[1]))
+    scale = 1e3 / current().drawn().size
     return {
         "x": [float(f"{v:.9g}") for v in x],
         "low": [float(f"{v:.5g}") for v in least * scale],
         "high": [float(f"{v:.5g}") for v in largest * scale],
-        "whole": [float(t_s[0]), float(t_s[-1])],
-        "readings": len(t_s),
+        "whole": list(shown.whole),
+        "readings": shown.readings,
     }
 
 
+@dataclass(frozen=True, slots=True)
+class _Overview:
+    """A whole run as a screen shows it: its envelope, its first and last time in s, and the number of its readings."""
+
+    drawn: tuple[F1, F1, F1]
+    whole: tuple[float, float]
+    readings: int
+
+
+@lru_cache(64)
+def _overview(store: Store, number: int, samples: int) -> _Overview:
+    """A run without its readings, which are large: who comes back to one of the last runs does not wait. ``samples``: it has so far."""
+    t_s, deviation_mm = _readings(store, number, samples)
+    if not len(t_s):
+        return _Overview((t_s, t_s, t_s), (0.0, 0.0), 0)
+    whole = float(t_s[0]), float(t_s[-1])
+    return _Overview(envelope(t_s, deviation_mm, *whole), whole, len(t_s))
+
+
 @lru_cache(1)
-def _readings(store: Store, number: int) -> tuple[F1, F1]:
-    """The valid readings of the run on the screen, cached since a stored run does not change."""
+def _readings(store: Store, number: int, _samples: int) -> tuple[F1, F1]:
+    """The valid readings of the run on the screen, cached until it has more samples."""
     columns = load_run(store, number).columns
     deviation_mm = np.empty(0) if columns.deviation_mm is None else columns.deviation_mm
     t_s = columns.t_s[: deviation_mm.size]

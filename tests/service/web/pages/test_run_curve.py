@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import zlib
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from abbe.service.web.pages.run_curve import PARTS, envelope
+from abbe.service.runs.columns import BAR_CODEC, bar_samples
+from abbe.service.storage.store import Store
+from abbe.service.web.pages.run_curve import PARTS, envelope, run_curve
+from tests.experiments.campaigns.plots import fill
 from tests.pages_world import Served, as_user
 
 
@@ -33,3 +39,19 @@ def test_the_readings_of_a_stored_run_in_the_readers_unit(running: Served) -> No
     assert np.array(inches["high"]) == pytest.approx(np.array(whole["high"]) / 0.0254, rel=1e-3)
     assert 2 < len(part["x"]) < len(whole["x"])
     assert [one.status_code for one in wrong] == [404, 404, 422, 422, 422]
+
+
+def test_a_run_that_grows_is_read_anew_and_the_last_ones_are_kept(tmp_path: Path) -> None:
+    with Store.open(fill(tmp_path, 0, 4000).url) as store:
+        for _ in range(2):
+            whole = run_curve(store, 1, -1e12, 1e12)
+            assert (len(whole["x"]), whole["readings"]) == (PARTS, 4000)
+        begin_s = whole["whole"][0]
+        assert len(run_curve(store, 1, begin_s + 1.0, begin_s + 1.5)["x"]) in range(501, 505), "a closer look shows the readings"
+        other = store.runs.start(store.campaigns.find("long").id, "r02", "ballbar_circle", "identify", store.runs.find(1).start_doc)
+        samples, seen = bar_samples(store.chunks.of_run(1)), []
+        for number in (0, 1):
+            part = samples[1000 * number : 1000 * (number + 1)]
+            store.chunks.append(other, "bar", number, part.size, BAR_CODEC, zlib.compress(part.tobytes()), 0.0, 0.0, 0, 1)
+            seen.append(run_curve(store, other, -1e12, 1e12)["readings"])
+    assert 0 < seen[0] < seen[1], "what has come since is shown"
