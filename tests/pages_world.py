@@ -21,7 +21,8 @@ import pytest
 from abbe.drivers.api import CompStatus, TableFormat
 from abbe.drivers.errors import LinkDown
 from abbe.drivers.tables import crc32, encode
-from abbe.models.compensation.tables import NineTables, nine_tables, predict_residual, quantise
+from abbe.models.compensation.nine_tables import nine_tables, predict_residual
+from abbe.models.compensation.tables import NineTables, quantise
 from abbe.service.audit.book import AuditBook
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.clock import SystemClock, utc_text

@@ -12,7 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F2
-from abbe.models.compensation.tables import NineTables, nine_tables, quantise
+from abbe.models.compensation.nine_tables import nine_tables
+from abbe.models.compensation.tables import NineTables, quantise
 from abbe.public.estimates import Estimate
 from abbe.public.picture import Picture
 from abbe.service.campaign_data.campaign_folder import Campaign

@@ -33,7 +33,8 @@ from abbe.models.compensation.distances import (
     random_pairs,
 )
 from abbe.models.compensation.grid import Mask, grid_table, quantise_grid
-from abbe.models.compensation.tables import NineTables, entry_u, grid_positions, nine_tables, quantise, table_design
+from abbe.models.compensation.nine_tables import entry_u, nine_tables, table_design
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.functions.motions import PLACES, SQUARENESS
 from abbe.models.geometry.bases import SMOOTH_ORDER, term_values
 from abbe.models.geometry.chain import design, deviation_mm, squareness_motions

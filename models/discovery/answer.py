@@ -4,9 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
-from abbe.models.arrays import F1, F2
+if TYPE_CHECKING:  # lists of stored results parse these records, and need no arrays
+    from abbe.models.arrays import F1, F2
 
 Verdict = Literal["none", "named", "unknown"]
 

@@ -79,11 +79,13 @@ def unit_deviation(machine: Machine, terms: tuple[Term, ...], points_mm: F2, too
     at = design(m, terms, points_mm)
     if frame is None:
         return at
-    reference = frame.reference_mm
-    motion = rigid_design(reference)
-    flat = motion.reshape(-1, 6)
-    fitted = np.linalg.lstsq(flat, design(m, terms, reference).reshape(-1, len(terms)), rcond=None)[0]
-    return np.asarray(at - rigid_at(points_mm, reference) @ fitted)
+    return np.asarray(at - rigid_at(points_mm, frame.reference_mm) @ rigid_fit(frame, design(m, terms, frame.reference_mm)))
+
+
+def rigid_fit(frame: RigidFree, at_reference: F3) -> F2:
+    """Return the best-fit rigid motion of p deviations at the reference points, shape (k, 3, p): mm and rad, shape (6, p)."""
+    flat = rigid_design(frame.reference_mm).reshape(-1, 6)
+    return np.asarray(np.linalg.lstsq(flat, at_reference.reshape(len(flat), -1), rcond=None)[0])
 
 
 def rigid_at(points_mm: F2, reference_mm: F2) -> F3:

@@ -11,11 +11,16 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from abbe.models.arrays import F1, F2, F3
-from abbe.models.geometry.volume import RigidFree, unit_deviation
+from abbe.models.arrays import F1, F2, F3, F4
+from abbe.models.geometry.bases import term_motions
+from abbe.models.geometry.chain import design
+from abbe.models.geometry.field import Lines, field_mm, grid_lines
+from abbe.models.geometry.volume import RigidFree, rigid_at, rigid_fit, unit_deviation
+from abbe.models.machine import with_tool
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.uncertainty.coverage import PROBABILITY, coverage_factor, effective_dof, vector_factor
+from abbe.models.uncertainty.on_grid import SHORTEST, grid_covariances
 from abbe.models.uncertainty.sources import SOURCE_TEXTS, ErrorSources
 
 NO_TRACE_SIGMA = 0.3
@@ -197,9 +202,11 @@ def predict_deviation(
     points = np.asarray(points_mm, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3 or not np.isfinite(points).all():
         raise ValueError(f"prediction: points_mm must be finite numbers of shape (m, 3), got shape {points.shape}")
-    parts = [_part(sources, points[i : i + CHUNK_POINTS], tool_mm, frame) for i in range(0, max(len(points), 1), CHUNK_POINTS)]
-    deviation, covariance = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
-    variance = np.concatenate([p[2] for p in parts], axis=1)
+    lines = grid_lines(points)
+    if lines is not None and min(line.size for line in lines) >= SHORTEST:
+        deviation, covariance, variance = _on_grid(sources, points, lines, tool_mm, frame)
+    else:
+        deviation, covariance, variance = _one_by_one(sources, points, tool_mm, frame)
     dof = np.array([s.dof for s in sources.sources])
     effective = effective_dof(variance.reshape(len(dof), -1), dof).reshape(deviation.shape)
     return Prediction(points, deviation, covariance, tuple(s.name for s in sources.sources), variance, effective, probability)
@@ -219,23 +226,62 @@ def propagated_covariance(per_unit: F3, factor: F2) -> F3:
     return np.asarray(influence @ np.swapaxes(influence, 1, 2))
 
 
-def _part(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
-    d = unit_deviation(sources.solution.machine, sources.terms, points, tool_mm, frame)
-    covariance = np.zeros((len(points), 3, 3))
-    variance = np.zeros((len(sources.sources), len(points), 3))
+def _one_by_one(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
+    parts = []
+    for i in range(0, max(len(points), 1), CHUNK_POINTS):
+        d = unit_deviation(sources.solution.machine, sources.terms, points[i : i + CHUNK_POINTS], tool_mm, frame)
+        propagated = np.stack([propagated_covariance(d, factor) for factor in _factors(sources)])
+        parts.append((d @ sources.coefficients, *_together(sources, propagated)))
+    deviation, covariance = (np.concatenate([p[k] for p in parts]) for k in (0, 1))
+    return deviation, covariance, np.concatenate([p[2] for p in parts], axis=1)
+
+
+def _on_grid(sources: ErrorSources, points: F2, lines: Lines, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
+    """The same of a full grid, whose covariances are tables of its lines (`abbe.models.uncertainty.on_grid`)."""
+    machine, terms, coefficients = with_tool(sources.solution.machine, tool_mm), sources.terms, sources.coefficients
+    deviation = field_mm(machine, lambda at: term_motions(terms, coefficients, at, machine.stroke_mm), points)
+    if frame is not None:
+        at_reference = design(machine, terms, frame.reference_mm) @ coefficients
+        deviation -= rigid_at(points, frame.reference_mm) @ rigid_fit(frame, at_reference)[:, 0]
+    covariance: F3 = np.empty((len(points), 3, 3))
+    variance: F3 = np.empty((len(sources.sources), len(points), 3))
+
+    def take(rows: slice, propagated: F4) -> None:
+        covariance[rows], variance[:, rows] = _together(sources, propagated)
+
+    grid_covariances(machine, terms, lines, frame, _factors(sources), take)
+    return deviation, covariance, variance
+
+
+def _factors(sources: ErrorSources) -> list[F2]:
+    """The factor of every source, then what is subtracted from some."""
+    return [s.factor for s in sources.sources] + [s.subtracted for s in sources.sources if s.subtracted is not None]
+
+
+def _together(sources: ErrorSources, propagated: F4) -> tuple[F3, F3]:
+    """Covariance of points, shape (m, 3, 3), and variance by source, (sources, m, 3), from the covariances by factor (`_factors`)."""
+    count = len(sources.sources)
+    subtracted = iter(propagated[count:])
+    covariance = np.zeros(propagated.shape[1:])
+    variance = np.zeros((count, *propagated.shape[1:3]))
     for k, source in enumerate(sources.sources):
-        share = propagated_covariance(d, source.factor) + source.scatter_mm**2 * np.eye(3)
+        share = propagated[k] + source.scatter_mm**2 * np.eye(3)
         if source.subtracted is not None:
-            share = _not_negative(share - propagated_covariance(d, source.subtracted))
+            share = _not_negative(share - next(subtracted))
         covariance += share
         variance[k] = np.einsum("mii->mi", share)
-    return d @ sources.coefficients, covariance, variance
+    return covariance, variance
 
 
 def _not_negative(covariance: F3) -> F3:
     """Set negative eigenvalues to zero, shape (m, 3, 3), so that a source never makes a prediction more certain."""
-    value, vector = np.linalg.eigh(covariance)
-    return np.asarray((vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2))
+    (a, b, c), (_, d, e), (_, _, f) = np.moveaxis(covariance, 0, 2)
+    minor = a * d - b * b
+    sure = (a > 0.0) & (minor > 0.0) & (minor * f + 2.0 * b * c * e - a * e * e - d * c * c > 0.0)  # Sylvester: all eigenvalues are
+    value, vector = np.linalg.eigh(covariance[~sure])
+    out: F3 = covariance.copy()
+    out[~sure] = (vector * np.maximum(value, 0.0)[:, None, :]) @ np.swapaxes(vector, 1, 2)
+    return out
 
 
 def unobserved_directions(solution: JointSolution) -> F2:

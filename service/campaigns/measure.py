@@ -30,9 +30,8 @@ from abbe.service.capture.machine_reading import LatestReading
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session, notes_since
-from abbe.service.domain.measured import DISK_FULL, RunStart, this_process
+from abbe.service.domain.measured import DISK_FULL, RunStart, RunTable, this_process
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
-from abbe.service.domain.run import RunTable
 from abbe.service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
 from abbe.service.sequences.control import Control, State

@@ -26,7 +26,7 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.artefact import ARTEFACT_TEST
 from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointRecord
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
-from abbe.service.runs.columns import LASER_CHANNEL, decode_json
+from abbe.service.runs.chunks import LASER_CHANNEL, decode_json
 from abbe.service.sequences.control import check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, BegunLine, HandLine, RunLine, lines_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource

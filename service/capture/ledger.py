@@ -14,7 +14,7 @@ from abbe.drivers.api import BarBatch, BarSample, bar_is_valid, bar_reasons, ove
 from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.segment import CHUNK, CLOSE, GAP, OPEN, Record, Scan
 from abbe.service.domain.measured import ChunkRecord
-from abbe.service.runs.columns import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, encode_bar, encode_json
+from abbe.service.runs.chunks import BAR_CODEC, JSON_CODEC, decode_bar, decode_json, encode_bar, encode_json
 from abbe.service.storage.store import Store
 
 

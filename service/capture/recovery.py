@@ -35,7 +35,7 @@ from abbe.service.capture.settings import (
 from abbe.service.domain.measured import INTERRUPTED, RUNNING, ChunkRecord, RunRecord, this_process
 from abbe.service.errors import AbbeError, CaptureConflict, CaptureFault, StoreError
 from abbe.service.files import lock_at_once
-from abbe.service.runs.columns import decode_json
+from abbe.service.runs.chunks import decode_json
 from abbe.service.storage.store import Store
 
 

@@ -33,6 +33,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # none is used, and to look for some reads the description of every package
     gc.set_threshold(50_000)  # what imports make stays: searching it for garbage would be a sixth of the start
     try:
         code = run(arguments)
@@ -49,16 +50,17 @@ def run(arguments: Sequence[str] | None = None) -> int:
     import typer
 
     from abbe.drivers.errors import DriverError
-    from abbe.service.cli.app import app
+    from abbe.service.cli.app import named_by
     from abbe.service.errors import AbbeError
 
     if sys.stdout is None:
         sys.stdout = _Closed()
     _degrade()
-    if (sys.argv[1:] if arguments is None else list(arguments)) == ["--version"]:  # the usual option
-        arguments = ["version"]
+    words = sys.argv[1:] if arguments is None else list(arguments)
+    if words == ["--version"]:  # the usual option
+        words = ["version"]
     try:
-        code = int(app(args=arguments, prog_name="abbe", standalone_mode=False) or 0)
+        code = int(named_by(words)(args=words, prog_name="abbe", standalone_mode=False) or 0)
         sys.stdout.flush()
         return code
     except (AbbeError, DriverError) as err:  # before OSError, to which a device's ReplyTimeout belongs too

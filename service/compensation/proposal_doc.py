@@ -8,13 +8,13 @@ from dataclasses import asdict, dataclass
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BeforeValidator, ConfigDict, Field, TypeAdapter
+from pydantic import BeforeValidator, ConfigDict, Field
 
 from abbe.drivers.tables import encode
 from abbe.models.arrays import F2
 from abbe.models.compensation.tables import NineTables, Predicted
 from abbe.models.machine import AXES
-from abbe.service.domain.document import Doc, canonical
+from abbe.service.domain.document import Doc, canonical, parsed
 from abbe.service.errors import StoreError
 from abbe.service.push.journal import approval_digest
 from abbe.service.push.validate import Candidate, PushLimits
@@ -158,10 +158,7 @@ def _plain(value: Any) -> Any:
 
 def proposed_from(doc: Doc) -> Proposed:
     """Read a document that `doc_of` wrote; raises ValueError for any other document."""
-    return _PROPOSED.validate_python(doc)
-
-
-_PROPOSED = TypeAdapter(Proposed)
+    return parsed(Proposed, doc)
 
 
 def load(store: Store, number: int) -> Proposed:

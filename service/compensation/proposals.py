@@ -19,8 +19,9 @@ import numpy as np
 from abbe.drivers.api import TableController, TableFormat
 from abbe.drivers.tables import FORMAT_VERSION
 from abbe.models.arrays import F2
+from abbe.models.compensation.nine_tables import nine_tables, predict_residual
 from abbe.models.compensation.plane import partial_tables
-from abbe.models.compensation.tables import NineTables, Predicted, nine_tables, predict_residual, quantise
+from abbe.models.compensation.tables import NineTables, Predicted, quantise
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.scales import SCALE_TEXTS
 from abbe.service.campaign_data.campaign_folder import from_store

@@ -18,8 +18,8 @@ from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.provenance import machine_digest
 from abbe.service.discovery.changed_text import proved
 from abbe.service.domain.finding import ChangedSince, ChangeRival, EffectFound, GapUm, MotionChange
+from abbe.service.domain.measured import RunTable
 from abbe.service.domain.results import SolutionRecord
-from abbe.service.domain.run import RunTable
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.effects.model_book import LASTING, applies, version
 from abbe.service.errors import AbbeError, StoreError, TableMismatch, Unusable

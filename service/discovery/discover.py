@@ -29,7 +29,8 @@ from abbe.service.domain.model_book import ModelBook, ModelVersion
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.effects.axis_test import SLOW_DRIFT
-from abbe.service.effects.model_book import applies, extended_book, readings_of, without
+from abbe.service.effects.effect_sums import readings_of, without
+from abbe.service.effects.model_book import applies, extended_book
 from abbe.service.errors import NotObservable
 from abbe.service.identification.removal import NO_TABLE, CampaignTable, remove_table, table_line
 from abbe.service.identification.solve import ALL_READINGS

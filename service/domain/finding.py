@@ -5,14 +5,15 @@ from __future__ import annotations
 import base64
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Literal, Self
 
-import numpy as np
 from pydantic import Field
 
-from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Agreement, BlindSpot, Fitted, Localization, NextTest, Unjudged, Verdict
 from abbe.service.domain.discovery_file import FoundThinning
+
+if TYPE_CHECKING:
+    from abbe.models.arrays import F1, F2
 
 READINGS = "base64 of float32, little endian, mm"
 MATRIX = "base64 of float64, little endian, lower triangle by rows"
@@ -29,11 +30,15 @@ class PackedReadings:
     @classmethod
     def of(cls, values_mm: F1) -> Self:
         """Pack readings, shape (n,)."""
+        import numpy as np
+
         return cls(n=int(values_mm.size), data=base64.b64encode(np.asarray(values_mm, dtype="<f4").tobytes()).decode())
 
     @property
     def values_mm(self) -> F1:
         """The readings, shape (n,)."""
+        import numpy as np
+
         return np.frombuffer(base64.b64decode(self.data), dtype="<f4").astype(np.float64)
 
 
@@ -48,12 +53,16 @@ class PackedCovariance:
     @classmethod
     def of(cls, matrix: F2) -> Self:
         """Pack a symmetric matrix, shape (n, n)."""
+        import numpy as np
+
         lower = np.asarray(matrix, dtype=np.float64)[np.tril_indices(len(matrix))]
         return cls(n=len(matrix), data=base64.b64encode(lower.astype("<f8").tobytes()).decode())
 
     @property
     def matrix(self) -> F2:
         """The matrix, shape (n, n)."""
+        import numpy as np
+
         out = np.zeros((self.n, self.n))
         out[np.tril_indices(self.n)] = np.frombuffer(base64.b64decode(self.data), dtype="<f8")
         return np.asarray(out + np.tril(out, -1).T)

@@ -12,14 +12,13 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Self, TypeVar
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-import numpy as np
-
-from abbe.models.arrays import F1, F2
 from abbe.service.domain.document import Doc, DocumentRow, HistoryRow, record
-from abbe.service.domain.run import RunTable
 from abbe.service.errors import StoreError
+
+if TYPE_CHECKING:
+    from abbe.models.arrays import F1, F2
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,6 +48,8 @@ class CommandedPath:
     @classmethod
     def from_document(cls, doc: Doc) -> Self:
         """Parse ``path`` of a start document."""
+        import numpy as np  # a list of runs has no path
+
         measured = doc.get("measured")
         return cls(
             points_mm=np.asarray(doc["points_mm"], dtype=np.float64).reshape(-1, 3),
@@ -79,6 +80,8 @@ class CommandedPath:
 
 def arc_of(points_mm: F2 | Sequence[Sequence[float]]) -> F1:
     """Length of a polyline up to each of its points, mm."""
+    import numpy as np
+
     steps = np.linalg.norm(np.diff(np.asarray(points_mm, dtype=np.float64), axis=0), axis=1)
     return np.concatenate(([0.0], np.cumsum(steps)))
 
@@ -144,6 +147,32 @@ class TouchRecord(TouchedFeature):
 
     ctrl_us: int
     temperature_C: float | None = None  # noqa: N815 - a name of the format
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunTable:
+    """The compensation table that was active during a run.
+
+    ``crc``: None if the controller did not state it; ``acting``: whether it acted, None if not recorded; ``document``: as stored.
+    """
+
+    crc: int | None = None
+    bank: int | None = None
+    acting: bool | None = None
+    boot_id: int | None = None
+    document: Doc = field(default_factory=dict, repr=False)
+
+    @classmethod
+    def from_document(cls, doc: Doc | None) -> Self:
+        """Parse ``table`` of a run; None counts as empty."""
+        known = doc or {}
+        numbers = {key: None if known.get(key) is None else int(known[key]) for key in ("crc", "bank", "boot_id")}
+        return cls(**numbers, acting=known.get("acting"), document=known)
+
+    @property
+    def acting_crc(self) -> int | None:
+        """CRC of the table, None if there was none, or if it did not act."""
+        return None if self.acting is False else self.crc
 
 
 @dataclass(frozen=True, kw_only=True, eq=False)

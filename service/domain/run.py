@@ -14,6 +14,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.paths import Law
 from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject
 from abbe.service.domain.document import Doc, parsed
+from abbe.service.domain.measured import RunTable
 from abbe.service.domain.run_file import RUN_FORMAT
 from abbe.service.errors import MeasurementFault, StoreError
 
@@ -310,32 +311,6 @@ def _number(value: Any) -> float | None:
 
 
 @dataclass(frozen=True, kw_only=True)
-class RunTable:
-    """The compensation table that was active during a run.
-
-    ``crc``: None if the controller did not state it; ``acting``: whether it acted, None if not recorded; ``document``: as stored.
-    """
-
-    crc: int | None = None
-    bank: int | None = None
-    acting: bool | None = None
-    boot_id: int | None = None
-    document: Doc = field(default_factory=dict, repr=False)
-
-    @classmethod
-    def from_document(cls, doc: Doc | None) -> Self:
-        """Parse ``table`` of a run; None counts as empty."""
-        known = doc or {}
-        numbers = {key: None if known.get(key) is None else int(known[key]) for key in ("crc", "bank", "boot_id")}
-        return cls(**numbers, acting=known.get("acting"), document=known)
-
-    @property
-    def acting_crc(self) -> int | None:
-        """CRC of the table, None if there was none, or if it did not act."""
-        return None if self.acting is False else self.crc
-
-
-@dataclass(frozen=True, kw_only=True)
 class RunPart:
     """An interrupted run whose readings belong to the run that resumed its path."""
 
@@ -395,7 +370,7 @@ class Run:
     machine: Doc = field(repr=False)
     setup: AnySetup
     columns: Columns = field(repr=False)
-    table: RunTable = RunTable()
+    table: RunTable = field(default_factory=RunTable)
     timing: RunTiming = RunTiming()
     state: RunState | None = None
     ended_utc: str = ""

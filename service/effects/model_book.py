@@ -1,20 +1,13 @@
 """The model book: versions of a machine's effects beyond its 21 error motions, the origin of each effect, and reverting.
 
-`readings_of` gives the contribution of the effects in the book to the readings of a campaign.
+`abbe.service.effects.effect_sums` gives the contribution of the effects in the book to the readings of a campaign, and adds them up.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
-import numpy as np
-
-from abbe.models.arrays import F1, F2
-from abbe.models.discovery.case import Case
-from abbe.models.effects.effect import Effect
-from abbe.models.effects.path import Path
 from abbe.service.domain.discovery import FindingSource
 from abbe.service.domain.document import document, record
 from abbe.service.domain.finding import EffectFound, EffectSize, Finding
@@ -23,9 +16,10 @@ from abbe.service.domain.results import ModelRecord, NewVersion
 from abbe.service.errors import ModelUnknown
 
 if TYPE_CHECKING:
+    from abbe.models.effects.effect import Effect
+    from abbe.service.effects.effect_sums import LabelSize
     from abbe.service.storage.store import Store
 
-Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 LASTING = ("drive", "structure", "geometry")
 """Families that stay with the machine. Thermal and instrument effects differ between campaigns and are searched for anew."""
 
@@ -36,74 +30,6 @@ def applies(entry: BookEffect, campaign: str) -> bool:
     return moves and (entry.family in LASTING or entry.origin.campaign == campaign)
 
 
-def readings_of(entries: Sequence[EffectSize], effects: tuple[Effect, ...], case: Case) -> dict[str, F1]:
-    """Return the contribution of known effects to the readings of every run, mm, by run label in the order of the case.
-
-    Raises
-    ------
-    ModelUnknown
-        The catalogue no longer has an effect, or has it with another number of coefficients.
-    """
-    total = {r.path.label: np.zeros(r.path.n) for r in case.runs}
-    paths = tuple(r.path for r in case.runs)
-    by_name = {e.name: e for e in effects}
-    for entry in entries:
-        effect = by_name.get(entry.name)
-        if effect is None:
-            raise ModelUnknown(
-                f"the model contains {entry.label}, which is not in the catalogue",
-                "install its plug-in, or go back to an older version: abbe model revert",
-            )
-        coefficients = np.asarray(entry.coefficients, dtype=np.float64)
-        found = _columns(effect, entry, paths)
-        shown = _shown(found, coefficients.size, [r.role == "identify" for r in case.runs])
-        usual = _usual(entry, coefficients)
-        for path, columns in zip(paths, found, strict=True):
-            if np.count_nonzero(shown) != coefficients.size:
-                raise ModelUnknown(
-                    f"{entry.label} has {coefficients.size} coefficients in the model and {columns.shape[1]} in this catalogue",
-                    "run abbe discover again with this version of Abbe, or go back to an older version of the model: abbe model revert",
-                )
-            total[path.label] += columns[:, shown] @ coefficients + usual * columns[:, ~shown].sum(axis=1)
-    return total
-
-
-def _shown(columns: list[F2], count: int, fitted: Sequence[bool]) -> Mask:
-    """Return a mask of the columns that the coefficients belong to, shape (k,): all columns, or those that a fitted run excites."""
-    everything = np.ones(columns[0].shape[1], dtype=bool)
-    if everything.size == count:
-        return everything
-    shown = np.any([np.abs(c).max(axis=0) > 0.0 for c, one in zip(columns, fitted, strict=True) if one], axis=0)
-    return np.asarray(shown) if np.count_nonzero(shown) == count else everything
-
-
-def _usual(entry: EffectSize, coefficients: F1) -> float:
-    """Return the expected coefficient for a new set-up of an instrument: the mean of the known ones if all have one sign, else zero."""
-    alike = len(coefficients) > 1 and bool(np.all(coefficients > 0.0) or np.all(coefficients < 0.0))
-    return float(np.mean(coefficients)) if entry.family == "instrument" and alike and not entry.forms else 0.0
-
-
-def _columns(effect: Effect, entry: EffectSize, paths: tuple[Path, ...]) -> list[F2]:
-    values = {name: p.value for name, p in entry.parameters.items()}
-    forms = {f.name: f.signal for f in effect.forms}
-    parts = [effect.signal(paths, entry.key, values)]
-    parts += [forms[name](paths, entry.key, values) for name in entry.forms if name in forms]
-    return [np.concatenate(of_run, axis=1) for of_run in zip(*parts, strict=True)]
-
-
-def without(case: Case, known_mm: dict[str, F1]) -> Case:
-    """Return the case with the known contributions, mm by run label, subtracted from its readings."""
-    runs = tuple(r if r.deviation_mm is None else replace(r, deviation_mm=r.deviation_mm - known_mm[r.path.label]) for r in case.runs)
-    return replace(case, runs=runs)
-
-
-ALIKE = 2.0
-"""Values of a non-linear parameter that differ by fewer standard uncertainties than this count as equal, and so do their columns."""
-OPPOSITE = -0.8
-"""If the cosine between two findings' coefficients is below this, the later finding reverses the earlier one; otherwise it is another
-change."""
-FORM = 0.1
-"""Relative standard uncertainty assumed for coefficients, because no machine follows a formula exactly."""
 LOOK = "`abbe model list` shows all versions"
 REMEDIES = {
     "table": "compensation tables",
@@ -112,15 +38,6 @@ REMEDIES = {
     "warm up or sensor": "warming up, or a temperature sensor",
     "set-up": "mounting the instrument anew",
 }
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class LabelSize:
-    """Total strength of all entries of a label and its standard uncertainty, in ``unit``."""
-
-    strength: float
-    u: float
-    unit: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -141,64 +58,6 @@ class Difference:
         """Unit of the sizes."""
         size = self.before or self.after
         return "" if size is None else size.unit
-
-
-def total(entries: Sequence[EffectSize], effect: Effect | None) -> LabelSize:
-    """Return the total size of several entries of one label: coefficients add up, unsigned sizes (an rms, a length) do not.
-
-    If the entries agree in their non-linear parameters and use the effect's main form, the total is the strength of the summed
-    coefficients, scaled to include the part that the present model absorbs (`Effect.unseen`). Otherwise, and for an effect outside the
-    catalogue, it is the sum of the strengths.
-    """
-    u, unit = float(np.hypot.reduce([e.u_strength for e in entries])), entries[-1].unit
-    if effect is None or len(entries) == 1 or entries[0].forms or not _addable(entries):
-        return LabelSize(strength=float(sum(e.strength for e in entries)), u=u, unit=unit)
-    values = {name: p.value for name, p in entries[-1].parameters.items()}
-    parts = [_coefficients(e) for e in entries]
-    own = [float(effect.strength(c, values)) for c in parts]
-    whole = sum(abs(e.strength) for e in entries) / max(sum(abs(s) for s in own), 1e-300)
-    return LabelSize(strength=whole * float(effect.strength(np.sum(parts, axis=0), values)), u=u, unit=unit)
-
-
-def cancels(entries: Sequence[EffectSize], by_name: Mapping[str, Effect]) -> bool:
-    """Whether the entries of a label add up to zero within their uncertainty, because the cause was repaired.
-
-    Signed strengths cancel as numbers. Entries with unsigned sizes cancel only if their coefficients have opposite directions and the
-    remainder does not exceed the noise.
-    """
-    strengths = [e.strength for e in entries]
-    if min(strengths) < 0.0 < max(strengths):
-        left = total(entries, by_name.get(entries[0].name))
-        return abs(left.strength) <= 2.0 * left.u
-    if len(entries) == 1 or not _addable(entries):
-        return False
-    parts = [_coefficients(e) for e in entries]
-    before, last = np.sum(parts[:-1], axis=0), parts[-1]
-    size = float(np.linalg.norm(before) * np.linalg.norm(last))
-    if size == 0.0 or before @ last > OPPOSITE * size:
-        return False
-    noise = sum(float(np.trace(e.covariance.matrix)) for e in entries if e.covariance is not None)
-    form = (2.0 * FORM * float(np.linalg.norm(before))) ** 2
-    return bool(np.sum((before + last) ** 2) <= 4.0 * noise + form)
-
-
-def _addable(entries: Sequence[EffectSize]) -> bool:
-    """Whether the coefficients of all entries belong to the same columns."""
-    first = entries[0]
-    return bool(first.coefficients) and all(
-        len(e.coefficients) == len(first.coefficients) and e.forms == first.forms and _alike(e, first) for e in entries
-    )
-
-
-def _alike(a: EffectSize, b: EffectSize) -> bool:
-    if a.parameters.keys() != b.parameters.keys():
-        return False
-    pairs = [(p, b.parameters[name]) for name, p in a.parameters.items()]
-    return all(abs(p.value - q.value) <= ALIKE * float(np.hypot(p.u or 0.0, q.u or 0.0)) for p, q in pairs)
-
-
-def _coefficients(entry: EffectSize) -> F1:
-    return np.asarray(entry.coefficients, dtype=np.float64)
 
 
 def versions(store: Store, machine: str | None = None) -> list[ModelVersion]:
@@ -246,7 +105,7 @@ def extended_book(
     discovery : int, optional
         Number of the discovery that made the finding.
     effects : tuple of Effect
-        The catalogue, for adding up several findings of one label (`total`).
+        The catalogue, for adding up several findings of one label (`abbe.service.effects.effect_sums.total`).
     """
     origin = Origin(campaign=source.campaign, discovery=discovery)
     new = [_entry(e, origin) for e in finding.effects]
@@ -271,7 +130,9 @@ def _entry(effect: EffectFound, origin: Origin) -> BookEffect:
 
 
 def _without_repaired(entries: list[BookEffect], effects: tuple[Effect, ...]) -> tuple[tuple[BookEffect, ...], tuple[str, ...]]:
-    """Return the entries without the repaired labels (`cancels`), and these labels."""
+    """Return the entries without the repaired labels (`abbe.service.effects.effect_sums.cancels`), and these labels."""
+    from abbe.service.effects.effect_sums import cancels
+
     by_name = {e.name: e for e in effects}
     labels = dict.fromkeys(e.label for e in entries)
     gone = tuple(label for label in labels if cancels([e for e in entries if e.label == label], by_name))
@@ -305,6 +166,8 @@ def differences(first: ModelVersion, second: ModelVersion, effects: tuple[Effect
 
 def _sizes(one: ModelVersion, by_name: dict[str, Effect]) -> dict[str, LabelSize]:
     """Return the total size by label."""
+    from abbe.service.effects.effect_sums import total  # a list of versions computes nothing
+
     same: dict[str, list[BookEffect]] = {}
     for e in one.book.effects:
         same.setdefault(e.label, []).append(e)

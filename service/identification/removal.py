@@ -15,7 +15,8 @@ from typing import Any
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.compensation.tables import NineTables, grid_positions, smooth_of, table_design
+from abbe.models.compensation.nine_tables import table_design
+from abbe.models.compensation.tables import NineTables, grid_positions, smooth_of
 from abbe.models.effects.effect import Effect
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.solvers.applied_tables import AppliedTables
@@ -30,7 +31,8 @@ from abbe.service.domain.finding import EffectSize
 from abbe.service.domain.run import BarSetup, Run
 from abbe.service.domain.solution_file import LostMotion, TableRemoval
 from abbe.service.effects.effect_catalogue import catalogue
-from abbe.service.effects.model_book import applies, current, no_table_lines, readings_of
+from abbe.service.effects.effect_sums import readings_of
+from abbe.service.effects.model_book import applies, current, no_table_lines
 from abbe.service.errors import TableMismatch
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.observations import run_data

@@ -12,7 +12,7 @@ from abbe.service.domain.machine import MachineObject
 from abbe.service.domain.measured import INCOMPLETE, RUNNING, ChannelRecord, ChunkRecord, Owner, RunFacts, RunRecord, visible_status
 from abbe.service.errors import NotStored, StoreError
 from abbe.service.queries.reader import Reader, as_stored, finite, of_row, read_as, storable
-from abbe.service.runs.columns import BAR_CODEC, IMPORTED_CHANNEL, JSON_CODEC, decode_bar, decode_json, pack_bar, run_document, whole_run
+from abbe.service.runs.chunks import BAR_CODEC, IMPORTED_CHANNEL, JSON_CODEC, decode_bar, decode_json, pack_bar
 from abbe.service.sequences.journal import Trouble, not_written, troubles
 from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.storage.store import Store
@@ -258,6 +258,8 @@ def columns(reader: Reader, run: int, first: int, limit: int) -> RunColumns:
     Unusable, MeasurementFault
         The run is not complete enough for an evaluation.
     """
+    from abbe.service.runs.columns import run_document, whole_run  # numpy, which a list of runs does not need
+
     reader.row("runs", run, "run")
     with as_stored():
         record = reader.store.runs.find(run)

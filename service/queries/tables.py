@@ -4,11 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 from abbe.service.clock import utc_text
 from abbe.service.compensation.proposal_decisions import ProposalStatus, proposal_status
-from abbe.service.compensation.proposal_diff import ACTIVE, TableDifference, compare
 from abbe.service.compensation.proposal_doc import Proposed, load
 from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
@@ -16,6 +15,9 @@ from abbe.service.errors import NotStored, Unusable
 from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
 from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.tables.push_journal import JournalView, TableHistory
+
+if TYPE_CHECKING:
+    from abbe.service.compensation.proposal_diff import TableDifference
 
 ProposalState = Literal["refused", "rejected", "proposed", "approved", "expired", "superseded", "pushed", "kept", "rolled back", "changed"]
 OPEN: tuple[ProposalState, ...] = ("proposed", "approved")
@@ -161,6 +163,8 @@ class ProposalDifference:
 
 def difference(reader: Reader, number: int, other: int | None = None) -> ProposalDifference:
     """Compare a proposal with another one, or with the table in force: nine tables with uncertainty. Raises NotStored."""
+    from abbe.service.compensation.proposal_diff import ACTIVE, compare  # it can draw pictures, a list of proposals has none
+
     for one in (number, other or number):
         reader.row("proposals", one, "proposal")
     with as_stored():

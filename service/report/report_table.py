@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from abbe.service.domain.run import Run, RunTable
+from abbe.service.domain.measured import RunTable
+from abbe.service.domain.run import Run
 from abbe.service.rendering.document import Sign
 from abbe.service.runs.exchange import Images
 from abbe.service.storage.store import Store

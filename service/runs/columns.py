@@ -1,27 +1,29 @@
-"""Read stored runs: the only place where raw samples become columns. Also the lossless packing of samples into chunks:
+"""Read stored runs: the only place where raw samples become columns.
 
-``bar/1``: zlib over ``<IQiH`` (seq, device_us, reading_nm, status) for each ball-bar sample.
-``json/1``: zlib over JSON lines, one record per line, floats as written by Python's ``repr``.
-
-`abbe.service.domain.measured` describes the documents beside the samples.
+`abbe.service.domain.measured` describes the documents beside the samples, `abbe.service.runs.chunks` the bytes.
 """
 
 from __future__ import annotations
 
-import json
-import struct
-import zlib
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from abbe.drivers.api import BarSample
 from abbe.service.domain.document import Doc, parsed
 from abbe.service.domain.measured import BarRecord, ChunkRecord, LaserRecord, RunRecord, RunStart, TouchRecord
 from abbe.service.domain.run import AnySetup, ArtefactSetup, BarSetup, Columns, Run, RunTiming, parsed_setup
 from abbe.service.errors import MeasurementFault, StoreError, StretchDiffers
+from abbe.service.runs.chunks import (
+    BAR_CHANNEL,
+    BAR_CODEC,
+    IMPORTED_CHANNEL,
+    JSON_CODEC,
+    LASER_CHANNEL,
+    decode_json,
+    whole_samples,
+)
 from abbe.service.runs.coverage import with_state
 from abbe.service.runs.pieces import ReadProgress, counted_columns, progress_of
 from abbe.service.runs.sample_columns import (
@@ -38,93 +40,11 @@ from abbe.service.runs.sample_columns import (
 from abbe.service.runs.touches import touch_columns
 from abbe.service.storage.store import Store
 
-BAR_CODEC = "bar/1"
-JSON_CODEC = "json/1"
-_SAMPLE = struct.Struct("<IQiH")
-_LEVEL = 1  # fastest; neighbouring samples differ little, so that a higher level is not worth its time
-
-
-def encode_bar(samples: Sequence[BarSample]) -> bytes:
-    """Pack ball-bar samples in order as a chunk ``bar/1``."""
-    return zlib.compress(pack_bar(samples), _LEVEL)
-
-
-def pack_bar(samples: Sequence[BarSample]) -> bytes:
-    """Pack ball-bar samples as consecutive ``<IQiH``, uncompressed."""
-    return b"".join(_SAMPLE.pack(one.seq, one.device_us, one.reading_nm, one.status) for one in samples)
-
-
-def decode_bar(payload: bytes) -> list[BarSample]:
-    """Unpack the samples of a chunk ``bar/1`` in order.
-
-    Raises
-    ------
-    StoreError
-        The bytes are not ``bar/1``.
-    """
-    return [BarSample(*fields) for fields in _SAMPLE.iter_unpack(_whole_samples(payload))]
-
 
 def bar_samples(chunks: Sequence[ChunkRecord]) -> BarSamples:
     """Unpack the samples of chunks ``bar/1`` in order; as `decode_bar`, but for millions of them. Raises StoreError."""
-    raw = b"".join(_whole_samples(chunk.payload) for chunk in chunks)
+    raw = b"".join(whole_samples(chunk.payload) for chunk in chunks)
     return np.frombuffer(raw, BAR_SAMPLE)
-
-
-def _whole_samples(payload: bytes) -> bytes:
-    raw = _inflate(payload, BAR_CODEC)
-    if len(raw) % _SAMPLE.size:
-        raise StoreError(
-            f"a chunk of codec {BAR_CODEC} has {len(raw)} bytes, not a multiple of {_SAMPLE.size}",
-            "it was not written by Abbe, or is damaged: restore a backup",
-        )
-    return raw
-
-
-def encode_json(records: Iterable[dict[str, Any]]) -> bytes:
-    """Pack JSON objects in order as a chunk ``json/1``.
-
-    Raises
-    ------
-    StoreError
-        A number is NaN or infinite.
-    """
-    try:
-        lines = "\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False, separators=(",", ":")) for one in records)
-    except ValueError:
-        raise StoreError("a record with NaN or Infinity is not stored", "give null where there is no value") from None
-    return zlib.compress(lines.encode(), _LEVEL)
-
-
-def decode_json(payload: bytes) -> list[dict[str, Any]]:
-    """Unpack the objects of a chunk ``json/1`` in order.
-
-    Raises
-    ------
-    StoreError
-        The bytes are not ``json/1``.
-    """
-    text = _inflate(payload, JSON_CODEC)
-    try:
-        return [json.loads(line) for line in text.split(b"\n") if line]
-    except ValueError as err:
-        raise StoreError(
-            f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})", "it was not written by Abbe, or is damaged: restore a backup"
-        ) from None
-
-
-def _inflate(payload: bytes, codec: str) -> bytes:
-    try:
-        return zlib.decompress(payload)
-    except zlib.error as err:
-        raise StoreError(
-            f"a chunk of codec {codec} cannot be unpacked ({err})", "it was not written by Abbe, or is damaged: restore a backup"
-        ) from None
-
-
-BAR_CHANNEL = "bar"
-LASER_CHANNEL = "laser"
-IMPORTED_CHANNEL = "columns"
 
 
 def load_run(store: Store, id_or_label: int | str) -> Run:

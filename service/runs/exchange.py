@@ -17,7 +17,8 @@ from abbe.service.domain.run import Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, ErrorsFile, RunEntry
 from abbe.service.errors import FileFormatError, StoreError
 from abbe.service.runs.checks import check, check_run, read_json
-from abbe.service.runs.columns import JSON_CODEC, encode_json, pack_columns, run_document, single_run, whole_run
+from abbe.service.runs.chunks import JSON_CODEC, encode_json
+from abbe.service.runs.columns import pack_columns, run_document, single_run, whole_run
 from abbe.service.storage.store import Store
 
 CAMPAIGN_FILE = "campaign.json"

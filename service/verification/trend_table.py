@@ -6,13 +6,13 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import datetime
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from abbe.models.arrays import F1
-from abbe.models.trend import CUSUM_H, CUSUM_K, Trend, average_run_length, mean_of, trend
 from abbe.service.domain.results import VerificationRecord
+
+if TYPE_CHECKING:  # a machine without checks has no trend, and a list of alarms computes none
+    from abbe.models.arrays import F1
+    from abbe.models.trend import Trend
 
 DAY_S = 86400.0
 COVERAGE = 2.0
@@ -74,6 +74,8 @@ class FigureChart:
     @property
     def centre(self) -> float:
         """The mean with which the chart compares: of the checks before a drift, or of all."""
+        from abbe.models.trend import mean_of
+
         before = len(self.values) if self.found.since is None else max(self.found.since, 1)
         return mean_of(self.values[:before], self.expanded[:before] / COVERAGE)[0]
 
@@ -151,6 +153,10 @@ def _of_figure(key: str, docs: Sequence[tuple[datetime, dict[str, Any]]]) -> Fig
     rows = _rows(key, docs)
     if not rows:
         return None
+    import numpy as np
+
+    from abbe.models.trend import trend
+
     limit = docs[-1][1]["limits"].get(key)
     days = np.array([(at - rows[0][0]).total_seconds() / DAY_S for at, _, _ in rows])
     values, expanded = np.array([v for _, v, _ in rows]), np.array([u for _, _, u in rows])
@@ -179,4 +185,6 @@ def _days(days: float) -> str:
 
 def chart() -> dict[str, float]:
     """Settings of the control chart, for programs that draw it."""
+    from abbe.models.trend import CUSUM_H, CUSUM_K, average_run_length
+
     return {"cusum_k": CUSUM_K, "cusum_h": CUSUM_H, "checks_to_a_false_alarm": round(average_run_length())}

@@ -18,7 +18,7 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.errors import RunInterrupted, Stopped
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.journal import HAND, INCIDENT, NoJournal
 from abbe.service.sequences.runner import Runner

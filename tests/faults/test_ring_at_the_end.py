@@ -16,7 +16,7 @@ from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.capture.recovery import ledger_of
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.clock import SystemClock
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 from tests.faults.serial_rig import Stage, Tap, stage
 from tests.patience import within

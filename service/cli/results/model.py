@@ -24,7 +24,7 @@ from abbe.service.cli.common import (
 
 if TYPE_CHECKING:
     from abbe.service.domain.model_book import ModelVersion
-    from abbe.service.effects.model_book import LabelSize
+    from abbe.service.effects.effect_sums import LabelSize
     from abbe.service.storage.store import Store
 
 

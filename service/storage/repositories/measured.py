@@ -268,7 +268,7 @@ class Chunks(Repository):
         n : int
             Number of samples.
         codec : str
-            Packing of ``payload`` (`abbe.service.runs.columns`).
+            Packing of ``payload`` (`abbe.service.runs.chunks`).
         first_host_s, last_host_s : float
             Monotonic host time of the first and last arrival.
         first_device_us, last_device_us : int

@@ -23,7 +23,7 @@ from abbe.drivers.links.urls import parse_url
 from abbe.service.capture.recorder import recording
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.clock import SystemClock
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 from tests.experiments.bench.capture_case import SAMPLES, device_us, reading_nm
 

@@ -22,7 +22,8 @@ import numpy as np
 
 from abbe.models.compensation.distances import DistanceStatistics, Pairs, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import grid_table, quantise_grid
-from abbe.models.compensation.tables import nine_tables, quantise
+from abbe.models.compensation.nine_tables import nine_tables
+from abbe.models.compensation.tables import quantise
 from abbe.models.planning.measurements import Instruments
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs

@@ -23,7 +23,7 @@ from abbe.service.capture.recorder import recording
 from abbe.service.capture.recovery import ledger_of, read_segment, recover_segments
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
 from abbe.service.clock import SystemClock
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 
 SETTINGS = CaptureSettings(reserve_bytes=65536, keep=True)

@@ -26,7 +26,7 @@ import numpy as np
 from playwright.sync_api import Browser, Page
 
 from abbe.service.domain.schedule import Schedule
-from abbe.service.runs.columns import BAR_CODEC
+from abbe.service.runs.chunks import BAR_CODEC
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
 from abbe.service.web.login.authentication import COOKIE

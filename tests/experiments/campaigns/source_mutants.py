@@ -35,14 +35,14 @@ SILENT = "tests/service/sequences/test_watch_laser.py::test_a_laser_that_is_sile
 UNVERIFIED = "tests/push/test_unverified_tables.py"
 PROPOSALS = "tests/scenarios/test_proposals.py"
 MACHINE, BACK, LEARN = "service/push/machine.py", "service/push/back.py", "service/push/operations.py"
-TABLES, ADAPTER = "models/compensation/tables.py", "service/push/execute.py"
+TABLES, BEST, ADAPTER = "models/compensation/tables.py", "models/compensation/nine_tables.py", "service/push/execute.py"
 NOT_SAFE = '    if truth.unsafe:\n        return _pending(state, f"not safe now: {truth.unsafe}")\n'
 
 MUTANTS = (
     Mutant("lease that ends while it is activated", MACHINE, "truth.lease_ms < LEASE_LEFT_MS", "truth.lease_ms < 0", (SINGLE + "::test_a_lease_that_is_about_to_end_is_no_time_to_activate",), True),
     Mutant("reference of a table one unit off", "service/push/validate.py", "abs(v[0]) > ZERO_MM", "abs(v[0]) > 500 * ZERO_MM", ("tests/push/test_bad_tables.py::test_the_reference_stays_where_it_is",), True),
     Mutant("jitter of the ball-bar's clock eight times wider", "drivers/ballbar/stream.py", "_JITTER = 0.05", "_JITTER = 0.4", (GATE + "::test_a_clock_that_is_off_by_more_than_a_twentieth_of_a_period_does_not_confirm_the_number",), True),
-    Mutant("sign of the nine tables", TABLES, "corrections.append(-(relative @", "corrections.append((relative @", (SIGN + "::test_an_axis_that_goes_too_far_is_told_to_go_less_far",), True),
+    Mutant("sign of the nine tables", BEST, "corrections.append(-(relative @", "corrections.append((relative @", (SIGN + "::test_an_axis_that_goes_too_far_is_told_to_go_less_far",), True),
     Mutant("sign of the grid", "models/compensation/grid.py", "rigid @ frame - error", "rigid @ frame + error", (SIGN,)),
     Mutant("sign of single motions", "models/compensation/achievable.py", "return -deviation_mm(", "return deviation_mm(", (SIGN,)),
     Mutant("sign of squareness parameters", "models/compensation/achievable.py", "out[:, first] -= sign", "out[:, first] += sign", (KINDS + "::test_parameters_and_their_tables_correct_the_same_distances_as_the_nine",)),

@@ -9,7 +9,8 @@ import pytest
 
 from abbe.models.compensation.achievable import cross_only, enough_for_the_field, motion_tables, positioning_only, squareness_tables
 from abbe.models.compensation.grid import grid_table
-from abbe.models.compensation.tables import nine_tables, quantise
+from abbe.models.compensation.nine_tables import nine_tables
+from abbe.models.compensation.tables import quantise
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth
 

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.additive import additive, mean_linear
-from abbe.models.compensation.tables import nine_tables, predict_residual
+from abbe.models.compensation.nine_tables import nine_tables, predict_residual
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import remove_rigid, rigid_design, volume_grid
 from abbe.models.solvers.joint import JointSolution

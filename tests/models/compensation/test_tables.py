@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import abbe.models.compensation.additive as additive
-from abbe.models.compensation.tables import nine_tables
+from abbe.models.compensation.nine_tables import nine_tables
 from abbe.models.geometry.volume import field_statistics, volume_grid
 from abbe.models.paths import DIAGONALS, diagonal_ends
 from tests.models.solvers.truth import MACHINE

@@ -20,7 +20,8 @@ from abbe.models.compensation.grid import (
     quantise_grid,
     trilinear,
 )
-from abbe.models.compensation.tables import grid_positions, model_uncertainty_mm, nine_tables
+from abbe.models.compensation.nine_tables import model_uncertainty_mm, nine_tables
+from abbe.models.compensation.tables import grid_positions
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import RigidFree, remove_rigid, rigid_design, volume_grid
 from abbe.models.solvers.joint import solve_joint

@@ -18,7 +18,8 @@ from abbe.models.compensation.achievable import (
 from abbe.models.compensation.additive import SQUARENESS_SLOPES, mean_linear
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
 from abbe.models.compensation.grid import quantisation_mm
-from abbe.models.compensation.tables import NineTables, grid_positions, nine_tables, quantise, table_design
+from abbe.models.compensation.nine_tables import nine_tables, table_design
+from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.solvers.assessment import observability_of
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.inputs import StatedInputs

@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.compensation.tables import NineTables, model_uncertainty_mm, nine_tables, quantise, smooth_of
+from abbe.models.compensation.nine_tables import model_uncertainty_mm, nine_tables
+from abbe.models.compensation.tables import NineTables, quantise, smooth_of
 from abbe.models.geometry.chain import travel_sign
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine

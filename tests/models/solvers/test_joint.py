@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from abbe.models.compensation.additive import mean_linear
-from abbe.models.compensation.tables import nine_tables, predict_residual, quantise
+from abbe.models.compensation.nine_tables import nine_tables, predict_residual
+from abbe.models.compensation.tables import quantise
 from abbe.models.geometry.volume import field_statistics, remove_rigid, rigid_design, volume_grid
 from abbe.models.paths import diagonal_ends, straight_line
 from abbe.models.solvers.joint import JointSolution, solve_joint

@@ -20,7 +20,7 @@ from abbe.service.capture.recovery import recover_segments
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.cli import run
 from abbe.service.errors import BackupRefused, StoreError
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.copying import copy_online, prove_copy, rows_of
 from abbe.service.storage.store import Store
 from tests.service.backup.conftest import SAMPLES, Shop, new_machine_file

@@ -12,7 +12,7 @@ from abbe.service.capture.recovery import ledger_of, read_segment
 from abbe.service.capture.settings import CaptureSettings
 from abbe.service.clock import SystemClock
 from abbe.service.errors import DiskFull
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import assert_true, batch, new_run
 

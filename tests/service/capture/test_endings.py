@@ -25,7 +25,7 @@ from abbe.service.capture.settings import CaptureSettings, segment_folder, segme
 from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.repositories import measured as store_measured
 from abbe.service.storage.store import Store
 from tests.patience import within

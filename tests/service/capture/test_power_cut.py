@@ -14,7 +14,7 @@ from abbe.service.capture.recorder import GROUP_S
 from abbe.service.capture.recovery import ledger_of, recover_segments
 from abbe.service.capture.segment import CHUNK, Segment, scan
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import Tape, abandon, assert_true, batch, new_run
 

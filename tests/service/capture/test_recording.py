@@ -20,7 +20,7 @@ from abbe.service.capture.settings import CaptureSettings, segment_folder, segme
 from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import ChunkRecord
 from abbe.service.errors import CaptureConflict, CaptureFault, ConfigError, DiskFull
-from abbe.service.runs.columns import decode_bar, decode_json
+from abbe.service.runs.chunks import decode_bar, decode_json
 from abbe.service.storage.store import Store
 from tests.patience import within
 from tests.service.capture.capture_bench import BrokenDisk, JumpingClock, SmallDisk, assert_true, batch, new_run

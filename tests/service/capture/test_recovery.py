@@ -12,7 +12,7 @@ from abbe.service.capture.recovery import DAMAGED, ledger_of, read_segment, reco
 from abbe.service.capture.segment import CHUNK, encode, scan
 from abbe.service.capture.settings import CaptureSettings, segment_path
 from abbe.service.domain.measured import RunRecord
-from abbe.service.runs.columns import decode_bar
+from abbe.service.runs.chunks import decode_bar
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import abandon, assert_true, batch, new_run, segment_bytes
 

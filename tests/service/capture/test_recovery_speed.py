@@ -14,7 +14,7 @@ from abbe.service.capture.ledger import Drafter
 from abbe.service.capture.recovery import recover_segments
 from abbe.service.capture.segment import CHUNK, Record, Segment
 from abbe.service.capture.settings import CaptureSettings, segment_folder, segment_path
-from abbe.service.runs.columns import encode_bar
+from abbe.service.runs.chunks import encode_bar
 from abbe.service.storage.store import Store
 from tests.service.capture.capture_bench import Tape, abandon, new_run, samples
 

@@ -257,7 +257,7 @@ def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsy
         error.add_note("cup and bar may still be mounted: take them out before anything moves")
         raise error
 
-    monkeypatch.setattr(module, "app", fails)
+    monkeypatch.setattr(module, "named_by", lambda words: fails)
     assert cli.run(["check-config", "-m", "x"]) == 2
     assert capsys.readouterr().err == (
         "error ILK-003: the door is open - close it; cup and bar may still be mounted: take them out before anything moves\n"

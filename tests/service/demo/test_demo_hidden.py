@@ -13,7 +13,7 @@ from abbe.service.demo.demo_hidden import HiddenDemo, hidden_json, judged, truth
 from abbe.service.demo.simulator_process import HiddenTruth
 from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
-from abbe.service.effects.model_book import _usual
+from abbe.service.effects.effect_sums import _usual
 from tests.run_documents import run_of
 
 PLAY = {"name": "lateral_play", "key": "EYX", "parameters": {"strength": 6.0}, "wild": 7}

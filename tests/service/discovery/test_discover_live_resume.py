@@ -30,7 +30,8 @@ from abbe.service.discovery.discover_live import addition_count
 from abbe.service.domain.measured import Owner
 from abbe.service.domain.results import NewVersion
 from abbe.service.errors import MeasurementFault
-from abbe.service.runs.columns import JSON_CODEC, encode_json, pack_columns
+from abbe.service.runs.chunks import JSON_CODEC, encode_json
+from abbe.service.runs.columns import pack_columns
 from abbe.service.storage.repositories.measured import Campaigns, Chunks, Runs
 from abbe.service.storage.repositories.results import Discoveries
 from abbe.service.storage.store import Store

@@ -11,7 +11,8 @@ import pytest
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.domain.discovery import FindingSource
 from abbe.service.domain.finding import EffectFound, Finding, PackedCovariance
-from abbe.service.effects.model_book import extended_book, total
+from abbe.service.effects.effect_sums import total
+from abbe.service.effects.model_book import extended_book
 
 SOURCE = FindingSource(campaign="c1", machine_digest="m")
 

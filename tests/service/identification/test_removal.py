@@ -21,7 +21,7 @@ from abbe.service.campaign_data.campaign_folder import from_folder, from_store
 from abbe.service.compensation.proposals import check_same_table
 from abbe.service.discovery.discover import prepare
 from abbe.service.discovery.simulate import simulate
-from abbe.service.domain.run import RunTable
+from abbe.service.domain.measured import RunTable
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.errors import TableMismatch

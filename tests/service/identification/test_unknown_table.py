@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from abbe.models.compensation.tables import nine_tables, quantise
+from abbe.models.compensation.nine_tables import nine_tables
+from abbe.models.compensation.tables import quantise
 from abbe.models.geometry.volume import volume_frame, volume_grid
 from abbe.models.solvers.joint import solve_joint
 from abbe.models.uncertainty.prediction import predict_deviation

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from abbe.drivers.api import BarSample
 from abbe.service.errors import StoreError
-from abbe.service.runs.columns import decode_bar, decode_json, encode_bar, encode_json
+from abbe.service.runs.chunks import decode_bar, decode_json, encode_bar, encode_json
 
 SAMPLES = st.builds(
     BarSample,

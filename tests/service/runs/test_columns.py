@@ -11,7 +11,8 @@ import pytest
 from abbe.drivers.api import BarSample
 from abbe.service.domain.measured import ImportedRun
 from abbe.service.errors import MeasurementFault, StoreError
-from abbe.service.runs.columns import BAR_CODEC, JSON_CODEC, encode_bar, encode_json, load_run, pack_columns, run_document
+from abbe.service.runs.chunks import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
+from abbe.service.runs.columns import load_run, pack_columns, run_document
 from abbe.service.storage.store import Store
 
 RATE_HZ = 1000

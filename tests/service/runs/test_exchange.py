@@ -14,7 +14,8 @@ import pytest
 from abbe.drivers.api import BarSample
 from abbe.service.errors import FileFormatError, StoreError
 from abbe.service.runs.checks import UNITS, read_json
-from abbe.service.runs.columns import BAR_CODEC, encode_bar, load_run, run_document
+from abbe.service.runs.chunks import BAR_CODEC, encode_bar
+from abbe.service.runs.columns import load_run, run_document
 from abbe.service.runs.exchange import export_folder, import_folder, read_folder
 from abbe.service.storage.store import Store
 

@@ -12,7 +12,8 @@ from abbe.service.campaign_data.campaign_checks import time_issues
 from abbe.service.devices.session import KEPT, noted, notes_since
 from abbe.service.domain.measured import ChunkRecord, Owner, RunRecord
 from abbe.service.domain.run import Run
-from abbe.service.runs.columns import BAR_CODEC, encode_bar, single_run
+from abbe.service.runs.chunks import BAR_CODEC, encode_bar
+from abbe.service.runs.columns import single_run
 
 RATE_HZ = 100
 FEED_MM_S = 20.0

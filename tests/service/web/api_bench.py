@@ -31,7 +31,7 @@ from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.push.journal import StoreBook
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.runs.columns import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
+from abbe.service.runs.chunks import BAR_CODEC, JSON_CODEC, encode_bar, encode_json
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base
