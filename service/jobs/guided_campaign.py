@@ -112,10 +112,9 @@ async def _measured(context: InvestigationContext, source: RecipeSource, begins:
                     session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
                 )
             except BaseException as error:
-                error.add_note(
-                    f"completed runs of campaign {name!r} are kept: `abbe measure -m MACHINE.toml --resume {name!r}` resumes, then "
-                    f"`abbe comp propose -m MACHINE.toml {name!r}`"
-                )
+                kept = f"completed runs of campaign {name!r} are kept"
+                resume = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
+                error.add_note(f"{kept}; the search can be started again" if begins is not None else f"{kept}: {resume}")
                 raise
 
 
