@@ -153,6 +153,11 @@ class Limits(ConfigTable):
     )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
     temperature_c: Temperatures = Field(default=(18.0, 24.0), description="permitted air temperature of a measurement")
+    room_temperature_c: Temperatures | None = Field(
+        default=None,
+        description="lowest and highest air temperature by the room's own record; it counts where no laser recorded one, for example in a "
+        "campaign with a probe. A table is verified only in a range of at most 1 K",
+    )
     run_temperature_c: Temperatures | None = Field(
         default=None, description="air temperature, read from the laser, outside which a running measurement stops; absent: not watched"
     )

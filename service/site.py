@@ -24,7 +24,8 @@ class Site:
 
     ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``; one without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
-    stated temperature of the scales by axis. ``control``: identity of the control (`control_of`); empty without a control.
+    stated temperature of the scales by axis. ``room_c``: range of the air by the room's own record, None: not stated. ``control``: identity
+    of the control (`control_of`); empty without a control.
     """
 
     name: str
@@ -40,6 +41,7 @@ class Site:
     calibrated_until: dict[str, date] = field(default_factory=dict)
     two_people: bool = False
     materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
+    room_c: tuple[float, float] | None = None
     control: str = field(init=False)
 
     def __post_init__(self) -> None:
@@ -97,4 +99,5 @@ def site_of(config: MachineFile) -> Site:
         config.calibration.until(),
         limits.two_people,
         config.material.by_axis(),
+        limits.room_temperature_c,
     )

@@ -159,7 +159,8 @@ async def _push(context: PushContext, admission: Admission, made: StoredProposal
 
 
 def _figures(context: PushContext, solved: Solved, runs: list[Run]) -> VerificationFigures:
-    return figures(runs) if context.poses is None else pose_figures(runs, solved.joint)
+    room_c = context.site.room_c
+    return figures(runs, room_c) if context.poses is None else pose_figures(runs, solved.joint, room_c)
 
 
 def _misfit_mm(solved: Solved, before: list[Run], table: NineTables | None) -> float | None:

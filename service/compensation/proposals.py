@@ -87,7 +87,7 @@ def _plain(values: Any) -> list[float]:
 
 def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     used = [r for r in runs if r.identifies]
-    air = [float(t) for r in used for t in r.columns.air_c]
+    air = [float(t) for r in used for t in r.columns.air_c] or list(site.room_c or ())
     if not air or not np.isfinite(air).all():
         air = [float("nan")]
     p = promise.predicted

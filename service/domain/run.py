@@ -105,8 +105,9 @@ class Columns:
 
     @property
     def air_c(self) -> F1:
-        """Temperature of the air at each row, or of the artefact, °C; empty without such a column."""
-        return _floats(self.further["temperature_C"]) if "temperature_C" in self.further else self.temperatures_c.get("air", np.zeros(0))
+        """Temperature of the air at each row, or of the artefact, °C; empty if no row has one."""
+        found = _floats(self.further["temperature_C"]) if "temperature_C" in self.further else self.temperatures_c.get("air", np.zeros(0))
+        return found if np.isfinite(found).any() else np.zeros(0)
 
     def by_name(self) -> dict[str, NDArray[Any]]:
         """All columns by their names in the format, without those that are sealed or missing."""

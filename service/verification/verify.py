@@ -63,8 +63,10 @@ class VerificationFigures:
         return max(self.diagonals.values(), key=lambda f: f.value_mm)
 
 
-def figures(runs: list[Run]) -> VerificationFigures:
+def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> VerificationFigures:
     """Figures of a verification's runs: plain body diagonals and at most one helix.
+
+    ``room_c``: lowest and highest air temperature by the room's own record, which counts where no run recorded one.
 
     Raises
     ------
@@ -87,11 +89,11 @@ def figures(runs: list[Run]) -> VerificationFigures:
         raise MeasurementFault(
             f"these runs are not a verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
-    return VerificationFigures(diagonals, helix, _air_c(runs), frozenset(run.table.crc for run in runs))
+    return VerificationFigures(diagonals, helix, _air_c(runs) or room_c, frozenset(run.table.crc for run in runs))
 
 
-def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
-    """Figures of artefacts in poses that the solution ``known``, which knows their form, did not use.
+def pose_figures(runs: list[Run], known: JointSolution, room_c: tuple[float, float] | None = None) -> VerificationFigures:
+    """Figures of artefacts in poses that the solution ``known``, which knows their form, did not use; ``room_c`` as in `figures`.
 
     Raises
     ------
@@ -112,7 +114,7 @@ def pose_figures(runs: list[Run], known: JointSolution) -> VerificationFigures:
                 "turn the artefact, or shift it by more than a few mm",
             )
         poses[run.run_id] = pose_figure(data, known)
-    return VerificationFigures(poses, None, _air_c(runs), frozenset(run.table.crc for run in runs), "pose")
+    return VerificationFigures(poses, None, _air_c(runs) or room_c, frozenset(run.table.crc for run in runs), "pose")
 
 
 def _air_c(runs: list[Run]) -> tuple[float, float] | None:
@@ -128,10 +130,13 @@ def check_before(before: VerificationFigures) -> None:
     TableRefused
         A figure is not a number, or no air temperature is recorded.
     """
-    what = "" if before.finite else "a figure is not a number"
-    what = what or ("" if before.air_c is not None else "no air temperature was recorded")
+    what, remedy = "", "measure it again"
+    if not before.finite:
+        what = "a figure is not a number"
+    elif before.air_c is None:
+        what, remedy = "no air temperature was recorded", "measure with a laser's air sensor, or give room_temperature_c under [limits]"
     if what:
-        raise TableRefused(f"the first verification is no basis for a comparison: {what}", "measure it again; nothing was written")
+        raise TableRefused(f"the first verification is no basis for a comparison: {what}", f"{remedy}; nothing was written")
 
 
 @dataclass(frozen=True, slots=True)

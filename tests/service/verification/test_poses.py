@@ -36,6 +36,20 @@ def warmed(run):
     return replace(run, columns=replace(run.columns, further={**run.columns.further, "temperature_C": np.full(len(run.columns), 21.5)}))
 
 
+def test_the_room_counts_where_no_run_recorded_the_air(solved_and_last):
+    """A shop without a laser: its table is verified only if the room is held within 1 K."""
+    solved, last = solved_and_last
+    unknown = {name: values for name, values in last.columns.further.items() if name != "temperature_C"}
+    steady, wide, recorded = (20.5, 21.5), (20.0, 21.5), warmed(last)
+    last = replace(last, columns=replace(last.columns, further=unknown))
+    assert pose_figures([last], solved.joint).air_c is None
+    assert pose_figures([last], solved.joint, steady).air_c == steady
+    assert pose_figures([recorded], solved.joint, steady).air_c == (21.5, 21.5)
+    assert decide(*(pose_figures([run], solved.joint, steady) for run in (last, corrected(last)))).keep
+    kept = decide(*(pose_figures([run], solved.joint, wide) for run in (last, corrected(last))))
+    assert (kept.keep, "20.0 to 21.5 °C" in kept.text) == (False, True)
+
+
 def true_rms(last):
     """Deviation of the machine over a pose without the rigid motion, rms."""
     e = error_mm(*last.columns.q_mm[:, :2].T)
