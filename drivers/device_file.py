@@ -262,6 +262,8 @@ def load(name: str) -> tuple[DeviceFile, str]:
     except FileNotFoundError:
         known = ", ".join(sorted(p.stem for p in BUILTIN.glob("*.toml")))
         raise BadDeviceFile(str(path), "read device file", "it does not exist", f"give a path, or one of {known}") from None
+    except UnicodeDecodeError:
+        raise BadDeviceFile(str(path), "read device file", "it is not UTF-8 text", "give a readable TOML file in UTF-8") from None
     except (OSError, ValueError, RecursionError) as error:
         raise BadDeviceFile(str(path), "read device file", f"{error}", "give a readable TOML file in UTF-8") from None
     return checked(doc, str(path)), hashlib.sha256(data).hexdigest()
@@ -274,7 +276,8 @@ def checked(doc: dict[str, Any], where: str) -> DeviceFile:
     except ValidationError as error:
         first = min(error.errors(), key=lambda one: one["type"] != "extra_forbidden")
         key = ".".join(str(part) for part in first["loc"])
-        text = "unknown key" if first["type"] == "extra_forbidden" else first["msg"].removeprefix("Value error, ")
+        own = {"extra_forbidden": "unknown key", "missing": "the key is missing"}
+        text = own.get(first["type"], first["msg"].removeprefix("Value error, "))
         more = f" (and {error.error_count() - 1} more)" if error.error_count() > 1 else ""
         remedy = "docs/reference/device-file.md describes every key"
         raise BadDeviceFile(where, "read device file", f"{key + ': ' if key else ''}{text}{more}", remedy) from None

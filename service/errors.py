@@ -469,7 +469,7 @@ class Mistake:
     @property
     def expected(self) -> str:
         """One line: the expected and the found value."""
-        plain = self.message.removeprefix("Value error, ")
+        plain = self.message.removeprefix("Value error, ").partition(", unable to parse string")[0]
         plain = plain.replace("Input should be a valid", "expected a").replace("Input should be", "expected")
         for noun in ("integer", "array", "object"):
             plain = plain.replace(f"expected a {noun}", f"expected an {noun}")

@@ -145,7 +145,7 @@ def read_backup(folder: Path) -> Backup:
         wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
         if not wrong and (listed.pieces is not None or (folder / PIECES).exists()):
             check(folder / PIECES, listed.pieces or ListedPieces(0, 0, []))
-    except FileNotFoundError:
+    except (FileNotFoundError, NotADirectoryError):
         raise BackupRefused(f"{folder} is not a backup: it has no {LIST}", "give the folder that `abbe backup` made") from None
     except OSError as err:
         raise BackupRefused(f"{folder} cannot be read: {err.strerror}", "look at its rights and at the disk") from None

@@ -76,7 +76,21 @@ def run(arguments: Sequence[str] | None = None) -> int:
             return BAD_INPUT
         if "unexpected extra argument" in text and ".toml" in text:  # the machine file once stood there
             return complain("USE-001", f"{text} - name the machine file by -m FILE")
+        if err.__cause__ is not None:
+            text = _value_told(text, err.__cause__)
         return complain("USE-001", f"{text} - `abbe --help` lists commands, `abbe COMMAND --help` their options")
+
+
+def _value_told(text: str, cause: BaseException) -> str:
+    """Return an error about one value with the expected and the given value in place of the library's words."""
+    from pydantic import ValidationError
+
+    from abbe.service.errors import mistakes
+
+    if not isinstance(cause, ValidationError):
+        return text
+    first = mistakes(cause.errors())[0]
+    return text.replace(first.message, first.expected)
 
 
 class _Closed(io.TextIOBase):

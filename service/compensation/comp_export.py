@@ -130,6 +130,8 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
         doc = json.loads(read_plain(Path(source), LARGEST_SOLUTION))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}", "give the number of a solution or a file") from None
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{source}: is not UTF-8 text", "give a file of `abbe solve --json`") from None
     except ValueError as error:
         raise FileFormatError(f"{source}: is not JSON: {error}", "give a file of `abbe solve --json`") from None
     if not isinstance(doc, dict):
@@ -332,7 +334,8 @@ def read_key(key: str, files: tuple[TextFile, ...], settings: FormatSettings, *,
             lost_motion_mm={**out.lost_motion_mm, **part.lost_motion_mm},
         )
     if not (tables or out.products or out.lattice or out.motions or out.lost_motion_mm):
-        raise TableFileError(f"none of the files belongs to {control.name}", "give the files of one export")
+        given = ", ".join(f.name for f in files[:3]) + (f" and {len(files) - 3} more" if len(files) > 3 else "")
+        raise TableFileError(f"{given}: none of the files belongs to {control.name}", "give the files of one export")
     return replace(out, tables=tuple(tables))
 
 

@@ -145,7 +145,9 @@ def column_file(path: Path) -> ColumnFile:
     """
     try:
         return ColumnFile.model_validate(tomllib.loads(read_bytes(path).decode("utf-8")))
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as err:
+    except UnicodeDecodeError:
+        raise FileFormatError(f"{path}: is not UTF-8 text", "see docs/reference/instrument-files.md") from None
+    except tomllib.TOMLDecodeError as err:
         raise FileFormatError(f"{path}: not valid TOML: {err}", "see docs/reference/instrument-files.md") from None
     except ValidationError as err:
         first = mistakes(err.errors())[0]

@@ -140,6 +140,8 @@ def schema(
 
     try:
         written = [str(path) for path in write_schemas(folder)]
+    except FileExistsError:
+        raise ConfigError(f"{folder} is a file", "give the name of a folder") from None
     except OSError as err:
         raise ConfigError(f"{folder}: cannot be written: {err.strerror}", "give a writable folder") from None
     answer({"files": written}, *written, as_json=as_json)

@@ -109,6 +109,8 @@ def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
     [
         (["chek-config"], "error USE-001: No such command 'chek-config'. Did you mean 'check-config'?"),
         (["check-config"], "error CFG-001: no machine is named - give -m FILE"),
+        (["comp", "push", "missing.json"], "error USE-001: Invalid value for 'PROPOSAL': expected an integer, got 'missing.json' - "),
+        (["audit", "show", "--last", "0"], "error USE-001: Invalid value for '--last': expected greater than or equal to 1, got '0' - "),
         (["trend", "machine.toml"], "(machine.toml) - name the machine file by -m FILE"),
         (["runs", "--dp", "x"], "error USE-001: No such option: --dp"),
         (["runs"], "error STO-001: there is no database abbe.sqlite3 - give -m FILE or --db URL"),
@@ -185,7 +187,7 @@ def test_schema_writes_where_it_is_told(abbe: Abbe, tmp_path: Path) -> None:
     assert abbe("schema", tmp_path / "new").code == 0
     assert (tmp_path / "new" / "run.schema.json").exists()
     (tmp_path / "file").write_text("x")
-    assert "cannot be written" in abbe.fails("schema", tmp_path / "file")
+    assert "is a file - give the name of a folder" in abbe.fails("schema", tmp_path / "file")
 
 
 def test_version(abbe: Abbe) -> None:
