@@ -24,10 +24,11 @@ from abbe.service.rendering.document import Document
 from abbe.service.report.dry_run_page import dry_run_report
 from abbe.service.report.report import certified, numbered_report, solution_report, stored_report
 from abbe.service.report.report_discovery import simulation_report
-from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report
+from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
 from abbe.service.report.report_parts import Rules
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
+from tests.artefact_campaign import campaign as artefact_campaign
 from tests.pages_world import Filled, solved_campaign
 from tests.run_documents import run_of
 
@@ -137,6 +138,8 @@ def documents(filled: Filled, factory: pytest.TempPathFactory) -> dict[str, Docu
         solved = assess(solved_campaign(factory, filled.machine)[2])
         result = SolutionResult(solution_of(solved), account=solved)
         found["solution"] = solution_report(store, campaign, result, "2026-11-24T06:00:00+00:00", RULES)
+    plate = from_folder(artefact_campaign(factory.mktemp("plate")))
+    found["pose"] = run_report(Measured(replace(plate, name="p-1")), plate.runs[1].run_id, RULES)
     planned = plan_for(campaign.site, minutes=7.0, tools=Instruments(bar_lengths_mm=(100.0,)))
     found["plan"] = plan_report(campaign.site, planned)
     found["dry run"] = dry_run_report(filled.machine, campaign.site.machine, planned.campaign, tuple(planned.dry))

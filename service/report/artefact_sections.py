@@ -1,15 +1,19 @@
-"""Points of artefacts in a report: the deviation of the machine where they lay, as arrows, and the poses."""
+"""Points of artefacts in a report: one pose as it was read, the deviation of the machine where they lay, as arrows, and the poses."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from abbe.models.arrays import F2
+from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
+from abbe.models.solvers.observations import RunData
+from abbe.service.domain.run import Run
 from abbe.service.identification.artefact_answer import deviation_of_artefacts, touched_boxes_mm
-from abbe.service.rendering.document import PictureBlock, Section, TextTable
+from abbe.service.rendering.document import PictureBlock, ReportFigure, Section, TextTable
+from abbe.service.rendering.numbers import COVERAGE
 from abbe.service.rendering.plots.slices import PLANES, SlicePlane, SliceTexts, colour_top, magnification, slice_plot
+from abbe.service.verification.iso_report import Evaluated
 
 NODES = 9
 MOST = 3
@@ -66,3 +70,59 @@ def _poses(joint: JointSolution) -> TextTable:
         )
         rows.append((run.label, run.points.artefact, *extent, axes, str(len(set(zip(run.points.feature, run.t_s.tolist(), strict=True))))))
     return TextTable(head, rows)
+
+
+ALONE = "the deviation of the machine: one pose shows machine and form of the artefact together; solve three poses or more (abbe solve)"
+
+
+def pose_readings(run: Run, data: RunData) -> Evaluated:
+    """One pose as it was read, without the motion that fits it best: its features, their rms and their largest deviation.
+
+    ``data``: observations of ``run``. The uncertainty is that of repeated touches alone, as stated in the run.
+    """
+    assert data.points is not None
+    labels = list(dict.fromkeys(zip(data.points.feature, data.t_s.tolist(), strict=True)))
+    at = np.array([labels.index(k) for k in zip(data.points.feature, data.t_s.tolist(), strict=True)])
+    left = _without_motion(data)
+    deviation, nominal, u = np.zeros((len(labels), 3)), np.zeros((len(labels), 3)), np.zeros(len(labels))
+    deviation[at, data.points.component] = left
+    nominal[at] = data.points.nominal_mm
+    stated = dict(zip(run.columns.further["feature"].tolist(), run.columns.further["u_mm"].tolist(), strict=True))
+    u[:] = [stated[name] for name, _ in labels]
+    rms, u_rms = float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(u[at] ** 2) / left.size))
+    length = np.linalg.norm(deviation, axis=1)
+    worst = int(np.argmax(length))
+    group, method = "Features, without the motion that fits best", "as read"
+    figures = [
+        ReportFigure(group, "n", "features read", float(len(labels)), None, "", "count"),
+        ReportFigure(group, "rms", "rms deviation of machine and artefact together", 1e3 * rms, 1e3 * u_rms, "µm", method),
+        ReportFigure(
+            group, "max", f"largest deviation, at {labels[worst][0]}", 1e3 * float(length[worst]), 1e3 * float(u[worst]), "µm", method
+        ),
+    ]
+    return Evaluated(figures=figures, pictures=_read_features(nominal, deviation, u), not_observable=[ALONE])
+
+
+def _without_motion(data: RunData) -> F1:
+    """Deviations without the best-fit rigid motion, shape (n,), mm; a direction that was not sensed takes no part."""
+    assert data.points is not None
+    rows, away = data.points.component, data.points.nominal_mm - data.points.middle_mm
+    turned = np.stack([np.cross(axis, away) for axis in np.eye(3)], axis=2)
+    motion = np.column_stack([np.eye(3)[rows], turned[np.arange(rows.size), rows]])
+    return np.asarray(data.deviation_mm - motion @ np.linalg.lstsq(motion, data.deviation_mm, rcond=None)[0])
+
+
+def _read_features(nominal_mm: F2, deviation_mm: F2, u_mm: F1) -> list[PictureBlock]:
+    """Arrows at the features, in the plane in which the artefact is widest; none for features on a line."""
+    plane = max(PLANES, key=lambda p: np.prod([np.ptp(nominal_mm[:, k]) for k in PLANES[p][:2]]))
+    across, up, _ = PLANES[plane]
+    if min(np.ptp(nominal_mm[:, across]), np.ptp(nominal_mm[:, up])) <= 0.0:
+        return []
+    length, expanded = np.linalg.norm(deviation_mm, axis=1), COVERAGE * u_mm
+    data = SlicePlane(plane, nominal_mm[None], 1e3 * deviation_mm[None], 1e3 * expanded[None], (length > expanded)[None])
+    magnified = magnification(float(np.ptp(nominal_mm, axis=0).max()), 1e3 * float(length.max()))
+    texts = SliceTexts(
+        "Deviation at the features, axes of the artefact", "", "", "not larger than U", f"errors magnified {magnified:g} times"
+    )
+    caption = "Measured minus nominal, without the motion that fits best: machine and artefact together. U: repeated touches only."
+    return [PictureBlock(caption, [slice_plot(data, colour_top(1e3 * length), magnified, texts, key="features")])]

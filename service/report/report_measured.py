@@ -30,6 +30,7 @@ from abbe.service.rendering.plots.bars import uncertainty_bars
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.rendering.plots.residuals import residual_plot
 from abbe.service.report import report_parts as parts
+from abbe.service.report.artefact_sections import pose_readings
 from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
@@ -330,6 +331,8 @@ def _own(run: Run) -> Evaluated:
         data = run_data(run)
     except AbbeError as error:
         return Evaluated(not_observable=[f"figures of this run: {error.detail}"])
+    if run.is_artefact:
+        return pose_readings(run, data)
     above = (data.deviation_mm - nominal_reading(data)) * 1e3
     group, columns = "Readings", run.columns
     rows = [ReportFigure(group, "n", f"valid readings of {len(columns)}", float(columns.valid.sum()), None, "", "count")]

@@ -26,7 +26,10 @@ PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SlicePlane:
-    """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm; whether the length exceeds U, shape (a, b)."""
+    """Nodes of one plane, shape (a, b, 3), mm; deviation, µm; U (k = 2) of its length, µm; whether the length exceeds U, shape (a, b).
+
+    Nodes in a single row (a = 1) are places without an order: no lines connect them.
+    """
 
     plane: str
     grid_mm: Array
@@ -37,7 +40,7 @@ class SlicePlane:
 
 @dataclass(frozen=True, slots=True)
 class SliceTexts:
-    """Texts of the picture in the reader's language, and display units of positions and errors."""
+    """Texts of the picture in the reader's language, and display units of positions and errors; without lines, ``nominal`` is empty."""
 
     heading: str
     nominal: str
@@ -66,7 +69,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts
     """One plane. ``top``: upper end of the colours in the display unit; ``magnified``: mm drawn per mm of error."""
     across, up, _ = PLANES[data.plane]
     grid = data.grid_mm / texts.place.size
-    low, high = grid[0, 0], grid[-1, -1]
+    low, high = grid.reshape(-1, 3).min(axis=0), grid.reshape(-1, 3).max(axis=0)
     size = max(float(high[across] - low[across]), float(high[up] - low[up]))
     pad = MARGIN * size
     scale = SIDE / (size + 2.0 * pad)
@@ -82,7 +85,7 @@ def slice_plot(data: SlicePlane, top: float, magnified: float, texts: SliceTexts
     panel.draw_y(svg, f"{'XYZ'[up]} {texts.place.sign}", count=5)
     actual = grid + data.deviation_um * 1e-3 * magnified / texts.place.size
     known = np.where(data.significant[..., None], actual, np.nan)  # lines break at insignificant nodes
-    for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")):
+    for nodes, style in ((grid, "hidden-edge"), (known, "s-c2 thin")) if len(grid) > 1 else ():
         for line in (*nodes, *np.swapaxes(nodes, 0, 1)):
             svg.polyline([panel.at(float(p[across]), float(p[up])) for p in line], style)
     _arrows(svg, panel, data, (grid, actual), top, texts)
@@ -114,7 +117,8 @@ def _key(svg: Svg, y: float, top: float, texts: SliceTexts) -> None:
     draw_sequence(svg, (LEFT, y), cell, top, texts.error.sign)
     svg.circle((LEFT + SEQUENCE * cell + 56.0, y + 4.0), 4.0, "frame")
     svg.text((LEFT + SEQUENCE * cell + 66.0, y + 9.0), texts.uncertain, "t-small")
-    svg.legend((LEFT, y + 40.0), [("hidden-edge", texts.nominal), ("s-c2", texts.actual)])
+    if texts.nominal:
+        svg.legend((LEFT, y + 40.0), [("hidden-edge", texts.nominal), ("s-c2", texts.actual)])
 
 
 def steps(top: float) -> list[str]:

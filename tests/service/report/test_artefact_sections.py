@@ -13,7 +13,8 @@ from abbe.service.compensation.proposals import change_of
 from abbe.service.identification.artefact_answer import touched_boxes_mm
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.rendering.document import PictureBlock, TextTable
-from abbe.service.report.artefact_sections import artefact_sections
+from abbe.service.report.artefact_sections import artefact_sections, pose_readings
+from abbe.service.runs.observations import run_data
 from tests.artefact_campaign import campaign, error_mm
 
 
@@ -52,3 +53,31 @@ def test_tables_of_two_heights_take_out_what_both_have(solved: Solved) -> None:
     left = left.ravel() - basis @ np.linalg.lstsq(basis, left.ravel(), rcond=None)[0]
     assert np.sqrt(np.mean(left**2)) < 0.2 * promised.before_mm
     assert not change.correction_mm[2].any()
+
+
+def test_one_pose_shows_machine_and_artefact_together_without_the_best_motion(tmp_path: Path) -> None:
+    run = from_folder(campaign(tmp_path)).runs[1]
+    found = pose_readings(run, run_data(run))
+    count, rms, most = found.figures
+    x, y = (run.columns.further[f"deviation_{a}_mm"] for a in "xy")
+    place = np.array([run_data(run).points.nominal_mm[k, :2] for k in range(25)])  # type: ignore[union-attr]
+    own = (x - x.mean()) + 1j * (y - y.mean())
+    away = (place - place.mean(axis=0)) @ [1.0, 1.0j]
+    own -= 1j * away * (np.conj(1j * away) @ own).real / (np.abs(away) ** 2).sum()
+    assert count.value == 25
+    assert rms.value == pytest.approx(1e3 * np.sqrt(np.mean(np.abs(own) ** 2) / 2.0), rel=1e-6)
+    assert most.value == pytest.approx(1e3 * np.abs(own).max(), rel=1e-6)
+    assert rms.u is not None
+    assert most.u is not None
+    assert 0.0 < rms.u < most.u
+    assert "machine and form of the artefact together" in found.not_observable[0]
+    (picture,) = found.pictures
+    assert picture.svgs[0].count("<title>(") == 25
+
+
+def test_features_on_a_line_have_figures_and_no_picture(tmp_path: Path) -> None:
+    run = from_folder(campaign(tmp_path)).runs[0]
+    data = run_data(run)
+    assert data.points is not None
+    flat = replace(data, points=replace(data.points, nominal_mm=data.points.nominal_mm * [1.0, 0.0, 0.0]))
+    assert [pose_readings(run, flat).pictures, len(pose_readings(run, flat).figures)] == [[], 3]
