@@ -25,7 +25,7 @@ def python_command(module: str, *arguments: object) -> list[str]:
 
 @contextmanager
 def started_safely() -> Iterator[None]:
-    """Set ``PYTHONSAFEPATH`` for every Python process started inside, for example by ``multiprocessing``."""
+    """Set ``PYTHONSAFEPATH`` for every Python process started in this block, for example by ``multiprocessing``."""
     before = os.environ.get(SAFE)
     os.environ[SAFE] = "1"
     try:

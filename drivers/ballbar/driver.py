@@ -74,7 +74,7 @@ class Box:
         return info
 
     async def peek(self) -> int:
-        """Read the boot id without accepting it; failed communication raises the errors named in `accept`."""
+        """Read the boot id, but do not store it as the current one; failed communication raises the errors named in `accept`."""
         return (await self._talk.identify()).boot_id
 
     async def check_boot(self) -> None:
@@ -190,7 +190,7 @@ class SerialBallBar:
         return DeviceInfo("ballbar", info.model, str(info.serial_no), info.boot_id, firmware)
 
     async def peek_boot_id(self) -> int | None:
-        """Read the boot id of the box without accepting it; None without a reply."""
+        """Read the boot id of the box, but do not store it as the current one; None without a reply."""
         try:
             return await self._box.peek()
         except DriverError:

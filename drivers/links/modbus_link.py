@@ -162,9 +162,10 @@ class ModbusLine:
             await self._quarantine()
 
     def varied(self, request: Request, lead: int) -> tuple[Request, int]:
-        """Return the variant of the request to send now, and the number of extra registers it reads before the requested ones.
+        """Return the request to send now, and the number of extra registers that it reads before those asked for.
 
-        With a canary, reads alternate between functions 3 and 4 and have 0 to ``lead`` extra registers, so that a late reply is recognised.
+        On a line with a `Canary`, successive reads differ, so that a late reply to an earlier one is recognised: they alternate between
+        functions 3 and 4 and start 0 to ``lead`` registers earlier.
         """
         if self._canary is None or request.function in WRITES:
             return request, 0

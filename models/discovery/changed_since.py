@@ -43,10 +43,10 @@ FEWEST_SETUPS = 2
 
 @dataclass(frozen=True)
 class AskedChange:
-    """A candidate change of the p unknowns along the columns of ``directions``, shape (p, q).
+    """A candidate change of the machine: ``directions`` times q coefficients is added to the p unknowns. ``directions`` has shape (p, q).
 
-    The q coefficients are normal with mean 0 and one of ``sizes`` as standard deviation. ``several``: True for the shape of a motion, False
-    for a scale or squareness.
+    The coefficients are normal with mean 0; their standard deviation is one of ``sizes``. ``several`` tells whether the candidate is the
+    shape of a motion (True: several coefficients) or a scale or squareness (False: one).
     """
 
     name: str

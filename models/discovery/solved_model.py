@@ -60,7 +60,10 @@ def solve(problem: WhitenedProblem, picks: Sequence[Pick]) -> SolvedModel:
 
 
 def _steps(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], SolvedModel, SolvedModel]:
-    """Return the columns of the picks, the fit with their non-linear parameters held, and the fit with these free too."""
+    """Fit the picked effects twice: with their non-linear parameters fixed, then free.
+
+    Returns the columns of each pick and the two fits.
+    """
     raw = [p.raw(problem) for p in picks]
     sd = [p.prior_sd(problem, r.shape[1]) for p, r in zip(picks, raw, strict=True)]
     first = _fit(problem, raw, sd)

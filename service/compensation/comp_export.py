@@ -214,7 +214,7 @@ def export(
     holds_at: str = UNKNOWN,
     turned: bool | None = None,
 ) -> Exported:
-    """Return the best tables that a control (or a format alone) can hold, as the text of its files.
+    """Return the files of the tables that best correct the machine, of all kinds that a control or format can hold.
 
     Parameters
     ----------
@@ -227,7 +227,7 @@ def export(
     holds_at : str
         Temperature of the scales at which the solution holds.
     turned : bool, optional
-        Result of the 10 µm step (`sign_is_turned`); acts on formats whose sign no manual states.
+        Result of the 10 µm step (`sign_is_turned`). It is used only if no manual states the sign of the format.
 
     Raises
     ------

@@ -503,7 +503,7 @@ class Run:
         strange = set(self.columns.further[FEATURE].tolist()) - {f.id for f in features.features}
         if strange:
             why = f"run {self.run_id}: artefact {setup.artefact} has no feature {min(strange)!r}"
-            raise MeasurementFault(why, "correct the column feature or the artefact's list")
+            raise MeasurementFault(why, "correct the column 'feature' or the artefact's list")
         return replace(self, setup=replace(setup, features=features, cmm=(campaign.get("instruments") or {}).get("cmm") or {}))
 
     def with_readings(self, deviation_mm: F1) -> Run:

@@ -257,7 +257,7 @@ class LostMotion(FileObject):
 
 
 class TableRemoval(FileObject):
-    """The table that the runs were measured with, and the lost motion used to remove its effect beyond smooth corrections."""
+    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used for that."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]

@@ -298,7 +298,10 @@ def _traces(found: _Found) -> list[ResidualTrace]:
 
 
 def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
-    """Cells of the plane of axes ``a`` and ``b``, with the rms of the gap (before) divided by its noise; None if they span no area."""
+    """Return a map over axes ``a`` and ``b``: in each cell the rms of measured minus simulated, divided by the noise.
+
+    None if no reading lies there, or all at one place.
+    """
     points, ratio = _points(found)
     if not len(points):
         return None

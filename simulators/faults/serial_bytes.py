@@ -75,7 +75,7 @@ def every_nth(frames: list[bytes], n: int, draw: random.Random) -> Iterator[byte
 
 
 def repeated(frames: list[bytes], at: int, count: int) -> list[bytes]:
-    """Return the frames with frames ``at - count`` to ``at - 1`` repeated before frame ``at``."""
+    """Send the ``count`` frames before frame ``at`` twice; return all frames in the new order."""
     return frames[:at] + frames[max(0, at - count) : at] + frames[at:]
 
 

@@ -29,8 +29,8 @@ USABLE, GOOD = 3.0, 10.0
 class Knowing:
     """Covariances of the error motions' coefficients in their own units, shape (p, p).
 
-    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that comes from reading noise, per
-    mm^2 of its mean square over the readings.
+    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that comes from reading noise,
+    divided by the mean square of that noise, mm^2.
     """
 
     prior: F2

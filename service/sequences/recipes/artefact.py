@@ -159,7 +159,7 @@ def verifying_poses(machine: Machine, name: str, recipes: tuple[object, ...]) ->
     """Return the poses of a recipe as a verification: runs that no solution uses. Raises ConfigError if it holds other tests, or none."""
     poses = [r for r in recipes if isinstance(r, ArtefactTest)]
     if not poses or len(poses) < len(recipes):
-        raise ConfigError(f"recipe {name}: a verification by poses has tests of the kind artefact only", "leave the other tests out")
+        raise ConfigError(f"recipe {name}: a verification by poses allows only tests of kind 'artefact'", "leave the other tests out")
     return CampaignPlan(name, tuple(replace(r, role="holdout").plan(machine) for r in poses))
 
 

@@ -83,7 +83,7 @@ def test_an_nc_program_does_not_touch():
 def test_poses_that_verify_a_table_are_kept_out_of_the_solution():
     plan = verifying_poses(MACHINE, "check", (TEST,))
     assert [t.role for t in plan.tests] == ["holdout"]
-    with pytest.raises(ConfigError, match="tests of the kind artefact only"):
+    with pytest.raises(ConfigError, match="allows only tests of kind"):
         verifying_poses(MACHINE, "check", (TEST, object()))
 
 
