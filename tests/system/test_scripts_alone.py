@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import html
 import json
+from typing import Any
 
 import pytest
 from playwright.sync_api import Browser, Page, Route
@@ -92,7 +93,7 @@ def test_the_machine_disappears_when_it_says_nothing_new_and_a_reading_of_the_la
     tell = """async ([at, laserAt]) => {
       const { Machine } = await import('/static/machine.js');
       const machine = (globalThis.machine ??= new Machine(document.getElementById('live'), {}));
-      const reading = { at_ms: at, position_mm: [1, 2, 3], feed_mm_min: 0, override_percent: 100, door_open: false, air_c: null };
+      const reading = { at_ms: at, position_mm: [1, 2, 3], feed_mm_min: 0, override_percent: null, door_open: false, air_c: null };
       machine.show({ ...reading, laser_at_ms: laserAt, laser_mm: laserAt, beam_good: true });
       machine.hideOld();
       return [!document.getElementById('dro').hidden, machine.readings.map(([when]) => when), machine.hasLaser];
@@ -104,6 +105,7 @@ def test_the_machine_disappears_when_it_says_nothing_new_and_a_reading_of_the_la
         page.goto(f"{base}/live")
         page.clock.pause_at("2030-01-01")
         assert page.evaluate(tell, [1.0, 10.0]) == [True, [10.0], False]
+        assert page.inner_text("#dro-feed") == "0 (– %)", "the control has told no override that can be"
         assert page.evaluate(tell, [2.0, 10.0]) == [True, [10.0], False], "the reading is the same one"
         assert page.evaluate(tell, [3.0, 11.0]) == [True, [10.0, 11.0], True]
         page.clock.fast_forward(4900)
@@ -111,3 +113,29 @@ def test_the_machine_disappears_when_it_says_nothing_new_and_a_reading_of_the_la
         page.clock.fast_forward(200)
         assert page.evaluate(tell, [3.0, 11.0]) == [False, [10.0, 11.0], False], "an old answer is not shown again by being told again"
         assert page.evaluate(tell, [4.0, 11.0]) == [True, [10.0, 11.0], False]
+
+
+@pytest.mark.parametrize(("alarm", "answer"), [(0, 202), (3, 202), (3, 409)])
+def test_a_start_says_for_which_alarm_and_a_refusal_why(chromium: Browser, alarm: int, answer: int) -> None:
+    base, sent = f"http://127.0.0.1:{free_port()}", list[dict[str, Any]]()
+    data = f'data-recipe="identification" data-rate="100" data-alarm="{alarm}" data-key="k" data-csrf="c"'
+    form = f'<form id="start" {data}><input type="checkbox" required><button>Start</button><span role="alert"></span></form>'
+
+    def start(route: Route) -> None:
+        sent.append(route.request.post_data_json)
+        route.fulfill(status=answer, json={"detail": "alarm 3 is over"})
+
+    with browser(chromium) as seen:
+        page = seen.page
+        answered(page, base, [screen(form, script="new"), screen("<h1>Live</h1>", script="pad")], [])
+        page.route(f"{base}/api/v1/jobs", start)
+        page.goto(f"{base}/new?recipe=identification")
+        page.click("button")
+        assert sent == [], "nothing moves before the checklist is confirmed"
+        page.check("input")
+        page.click("button")
+        if answer == 202:
+            page.wait_for_url("**/live")
+        else:
+            page.wait_for_selector("[role=alert]:has-text('alarm 3 is over')")
+    assert sent == [{"recipe": "identification", "rate_hz": 100, "alarm": alarm}]

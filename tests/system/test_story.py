@@ -159,9 +159,15 @@ def test_from_a_drift_to_the_report_by_touches(chromium: Browser, tmp_path_facto
         with page.expect_download() as report:
             walk.touch(".path .go.main")
         assert Path(report.value.path()).read_bytes().startswith(b"%PDF-")
+        assert walk.touches <= 12
+        before = walk.touches
+        walk.touch(".strip .name")
+        walk.look("/")
+        with page.expect_download():
+            walk.touch("main a[href^='/api/v1/reports/verification/']")
+        assert walk.touches - before == 2, "from any screen to the report of the last check"
         assert walk.bad == []
         assert watch.errors == []
         assert watch.foreign == []
-        assert walk.touches <= 12
         assert [a.login for a in store.proposals.approvals(proposal)] == ["user:anna"]
         aside.shutdown()

@@ -36,7 +36,8 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
     async def page(request: Request, status: int, text: str = "", wait_s: float = 0.0) -> HTMLResponse:
         headers = {"Retry-After": str(ceil(wait_s))} if wait_s else None
         here = await asyncio.to_thread(_with_pin_here, auth, request)
-        return HTMLResponse(env.get_template("login.html").render(text=text, here=here), status, headers)
+        stop = await _stop_csrf(auth, request)
+        return HTMLResponse(env.get_template("login.html").render(text=text, here=here, stop=stop), status, headers)
 
     @app.get("/login", include_in_schema=False)
     @needs(PUBLIC)
@@ -84,6 +85,13 @@ def _add_logout(app: FastAPI, auth: Authenticator) -> None:
         answer = RedirectResponse("/login", 303)
         _set_cookie(auth, request, answer, "")
         return answer
+
+
+async def _stop_csrf(auth: Authenticator, request: Request) -> str:
+    """The token with which a session that has run out still stops the machine; empty without such a session."""
+    secret = request.cookies.get(auth.cookie(tls=is_tls(request, behind_tls=auth.behind_tls)), "")
+    known = await auth.who(None, secret, in_use=False, to_stop=True)
+    return csrf_token(secret) if secret and Permission.STOP in known.permissions else ""
 
 
 async def identified(auth: Authenticator, origin: LoginOrigin, name: str, secret: str) -> tuple[UserRecord | None, float, bool]:

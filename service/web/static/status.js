@@ -2,6 +2,8 @@
 // everything else from the server when the revision changes. Other screens are not replaced, since a person may be reading or filling in a
 // form.
 
+import { answered } from "./stop.js";
+
 const PERIOD_MS = 2000;
 const PATIENCE_MS = 5000;
 
@@ -75,33 +77,7 @@ async function showBar(status) {
   shownBar = next;
 }
 
-// A kept page has no token: it asks for that of the session first, which may have run out. Null: the service cannot be reached.
-async function stopAnswer(button) {
-  if (!button.dataset.csrf) {
-    const session = await ask("/api/v1/stop", true);
-    if (!session.ok) return session;
-    button.dataset.csrf = (await session.json()).csrf_token;
-  }
-  const headers = { "X-CSRF-Token": button.dataset.csrf };
-  return fetch("/api/v1/stop", { method: "POST", headers, signal: AbortSignal.timeout(PATIENCE_MS) });
-}
-
-// Until then a kept page is not replaced, so that the answer to Stop can be read.
-let readUntil = 0;
-
-// Stop stays in its place and works with a session that has run out; the answer stands beside it.
-async function stop(button) {
-  const show = (text) => setText("stop-answer", text);
-  readUntil = Infinity;
-  const answer = await stopAnswer(button).catch(() => null);
-  readUntil = performance.now() + PATIENCE_MS;
-  if (answer?.ok) show(words["strip.stopped"]);
-  else show(words[answer === null ? "strip.unreached" : answer.status === 409 ? "strip.nothing" : "strip.failed"]);
-}
-
 document.addEventListener("click", (event) => {
-  const button = event.target.closest("#stop");
-  if (button) stop(button);
   const point = event.target.closest("[data-href]");
   if (point) location.assign(point.dataset.href);
 });
@@ -160,7 +136,7 @@ async function refresh() {
       throw new Error(`status ${answer.status}`);
     }
     const status = await answer.json();
-    if (kept && performance.now() > readUntil) { location.reload(); return; }
+    if (kept && performance.now() > answered.until) { location.reload(); return; }
     if (kept) throw new Error("the answer to Stop is being read");
     seen = new Date();
     // The screen of an unavailable core has no revision: reload it, now that the core answers.

@@ -1,11 +1,11 @@
 // The service worker: keeps the frame of the screens and the last home page, so that a panel that loses the network shows the last state with
 // its time. It answers nothing else: no data of the interface, no socket, nothing that changes something.
 
-const SHELL = "abbe-shell-1";
+const SHELL = "abbe-shell-2";
 const STATE = "abbe-state-2";
 const HOME = "/";
 const SCREEN = /^\/[a-z]*$/;
-const FRAME = ["/static/page.css", "/static/status.js", "/static/send.js", "/icon.svg"];
+const FRAME = ["/static/page.css", "/static/status.js", "/static/stop.js", "/static/send.js", "/icon.svg"];
 // Longest time until an answer begins; its body may take any time.
 const HOME_MS = 5000;
 const SCREEN_MS = 60_000;
