@@ -243,7 +243,8 @@ class UserAccounts:
             self._store.people.change(user.id, keep_session=True, pin_failures=0)
             return user, False
         if tries >= MOST_WRONG_PINS:
-            self._store.people.change(user.id, keep_session=True, pin=None, pin_failures=0)
+            # The count stays until there is a new PIN: a try that has found the old one must not count from zero.
+            self._store.people.change(user.id, keep_session=True, pin=None)
         return None, tries >= MOST_WRONG_PINS
 
     def with_pin(self) -> list[UserRecord]:

@@ -176,6 +176,21 @@ def test_ten_wrong_pins_in_a_row_remove_the_pin_over_any_time_and_restart(world:
     assert tries(1) == [False]
 
 
+def test_a_right_pin_that_is_counted_after_the_tenth_wrong_one_is_refused(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
+    """It has found the user while the PIN was still there."""
+    world.people.add("olga", "operator", PHRASE)
+    world.people.set_pin("olga", "582914")
+    count = world.store.people.count_pin
+
+    def late(user_id: int) -> int:
+        monkeypatch.setattr(world.store.people, "count_pin", count)
+        assert [world.people.check_pin("olga", "000000")[1] for _ in range(MOST_WRONG_PINS)][-1], "the PIN is removed meanwhile"
+        return count(user_id)
+
+    monkeypatch.setattr(world.store.people, "count_pin", late)
+    assert world.people.check_pin("olga", "582914")[0] is None
+
+
 def test_simultaneous_guesses_of_a_pin_get_ten_hashes_of_it(world: World, monkeypatch: pytest.MonkeyPatch) -> None:
     world.people.add("olga", "operator", PHRASE)
     world.people.set_pin("olga", "582914")
