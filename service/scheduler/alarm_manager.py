@@ -27,7 +27,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification import verify
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, next_step
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, step_alone
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, alarms_of, check_facts, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")
@@ -207,7 +207,7 @@ class AlarmManager(RetryingStore):
     def _investigation(self, alarms: Sequence[Alarm]) -> FollowUp | None:
         for one in alarms:
             schedule = self._schedule_of(one)
-            if schedule is not None and schedule.on_alarm == "propose" and next_step(one) is not None:
+            if schedule is not None and schedule.on_alarm == "propose" and step_alone(one) is not None:
                 needs = replace(schedule.needs, idle=True)  # wait while the machine works or another process uses it
                 terms = replace(schedule, name=f"investigation of alarm {one.number}", recipe=self.duties.campaign, needs=needs)
                 return FollowUp(terms, _Investigation(self, one, terms, self.duties.investigate))
@@ -222,7 +222,7 @@ class AlarmManager(RetryingStore):
         return "" if one.active else f"alarm {number} is over: the last check passed, and there is no cause to look for"
 
     async def ordered(self, number: int, by: str, look: Investigate, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Investigate an alarm because the user ``by`` asked for it: after its last line, or anew if it had ended.
+        """Investigate an alarm because the user ``by`` asked for it: after its last line, or anew if it had an answer.
 
         Raises
         ------

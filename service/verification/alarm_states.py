@@ -150,7 +150,7 @@ def _followed(alarm: Alarm, line: AlarmEntryRecord) -> Alarm:
     if kind is AlarmKind.SHELVED:
         return replace(alarm, shelved_until_utc=facts.until_utc)
     if kind in OF_WORK:
-        anew = kind is AlarmKind.ORDERED and _has_ended(alarm)
+        anew = kind is AlarmKind.ORDERED and _is_answered(alarm)
         return replace(alarm, work=(line,) if anew else (*alarm.work, line))
     if not alarm.active:
         return alarm
@@ -164,22 +164,41 @@ def is_open(alarm: Alarm) -> bool:
 
 
 def next_step(alarm: Alarm) -> AlarmKind | None:
-    """Next step of the service in the investigation of an alarm; None: nothing to do now.
+    """Next step in the investigation of an alarm; None: nothing to do now.
 
     A failed step is retried once, after the next check that holds the alarm or when a person orders it. An interrupted step resumes from
-    its lines. An order after the end of the work begins it anew.
+    its lines. An order after an answer begins the work anew; after failures it keeps what is measured and found.
     """
-    if not alarm.active or _has_ended(alarm):
+    if not alarm.active or _is_answered(alarm) or _failures(alarm) >= TRIES:
         return None
     failed = alarm.last(AlarmKind.FAILED)
     if failed is not None and alarm.work[-1] is failed and alarm.judged_seq < failed.seq:
         return None
-    if alarm.last(AlarmKind.DISCOVERED) is not None:
-        return AlarmKind.PROPOSED
-    return AlarmKind.DISCOVERED if alarm.last(AlarmKind.MEASURED) is not None else AlarmKind.MEASURED
+    return step_of_order(alarm)
 
 
-def _has_ended(alarm: Alarm) -> bool:
-    """Whether the investigation has an answer, or has failed too often."""
-    failures = sum(line.kind is AlarmKind.FAILED for line in alarm.work)
-    return failures >= TRIES or alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None
+def step_of_order(alarm: Alarm) -> AlarmKind:
+    """Step with which an order of a person begins now."""
+    if _is_answered(alarm) or alarm.last(AlarmKind.MEASURED) is None:
+        return AlarmKind.MEASURED
+    return AlarmKind.DISCOVERED if alarm.last(AlarmKind.DISCOVERED) is None else AlarmKind.PROPOSED
+
+
+def step_alone(alarm: Alarm) -> AlarmKind | None:
+    """Next step that the service does without a person, as `next_step`.
+
+    Once a person has ordered the search, only an order measures: she agreed to be at the machine, not that it starts alone later.
+    """
+    step = next_step(alarm)
+    return None if step is AlarmKind.MEASURED and alarm.last(AlarmKind.ORDERED) is not None else step
+
+
+def _is_answered(alarm: Alarm) -> bool:
+    """Whether the investigation has ended with a proposal or with the reason why there is none."""
+    return alarm.last(AlarmKind.PROPOSED, AlarmKind.ENDED) is not None
+
+
+def _failures(alarm: Alarm) -> int:
+    """Number of failures since the last order, or since the alarm was raised."""
+    ordered = alarm.last(AlarmKind.ORDERED)
+    return sum(line.kind is AlarmKind.FAILED and (ordered is None or line.seq > ordered.seq) for line in alarm.work)

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind, Signal
-from abbe.service.verification.alarm_states import Alarm, FiredRule, after_check, folded, is_open, next_step
+from abbe.service.verification.alarm_states import Alarm, FiredRule, after_check, folded, is_open, next_step, step_alone, step_of_order
 
 RECIPE = "quick-check"
 TOMORROW = datetime(2026, 11, 23, tzinfo=UTC)
@@ -214,3 +214,31 @@ def test_an_order_goes_on_after_the_last_line_and_begins_anew_after_an_end() -> 
     assert next_step(book.alarms[0]) is None, "it has failed too often"
     book.add(1, AlarmKind.ORDERED, name="petra")
     assert next_step(book.alarms[0]) is AlarmKind.MEASURED
+
+
+def test_after_two_failures_an_order_keeps_what_is_measured_and_may_fail_twice_again() -> None:
+    book = Book()
+    book.check(BAD)
+    for kind in (AlarmKind.BEGUN, AlarmKind.MEASURED, AlarmKind.FAILED, AlarmKind.FAILED):
+        book.add(1, kind, campaign="c")
+    book.check(BAD)
+    assert next_step(book.alarms[0]) is None
+    assert step_of_order(book.alarms[0]) is AlarmKind.DISCOVERED
+    book.add(1, AlarmKind.ORDERED, name="petra")
+    for _ in range(2):
+        book.check(BAD)
+        assert next_step(book.alarms[0]) is AlarmKind.DISCOVERED
+        book.add(1, AlarmKind.FAILED)
+    book.check(BAD)
+    assert next_step(book.alarms[0]) is None
+
+
+@pytest.mark.parametrize("since", [(), (AlarmKind.BEGUN,), (AlarmKind.BEGUN, AlarmKind.FAILED)])
+def test_what_a_person_has_ordered_is_measured_by_order_only(raised: Book, since: tuple[AlarmKind, ...]) -> None:
+    for kind in (AlarmKind.ENDED, AlarmKind.ORDERED, *since):
+        raised.add(1, kind, name="petra")
+    raised.check(BAD)
+    assert next_step(raised.alarms[0]) is AlarmKind.MEASURED
+    assert step_alone(raised.alarms[0]) is None
+    raised.add(1, AlarmKind.MEASURED, campaign="c")
+    assert step_alone(raised.alarms[0]) is AlarmKind.DISCOVERED, "a search in what she measured moves nothing"

@@ -85,6 +85,22 @@ async def test_a_search_that_fails_is_told_by_its_alarm_but_one_that_found_the_m
     assert bench.lines()[-1].kind is last
 
 
+async def test_after_an_order_that_found_the_machine_in_use_the_service_does_not_measure_alone(bench: Bench) -> None:
+    for kind, facts in ((AlarmKind.RAISED, RAISED), (AlarmKind.BEGUN, AlarmFacts()), (AlarmKind.ENDED, AlarmFacts(text="no proposal"))):
+        lines = bench.lines()
+        bench.store.alarms.append("mill-7", lines[0].alarm if lines else None, len(lines), kind, facts, [])
+    assert await bench.desk.due() is None
+
+    async def fails(order: CampaignOrder) -> None:
+        raise MachineInUse("x")
+
+    async with asyncio.TaskGroup() as tasks:
+        assert (await Searching(bench, fails).ordered(tasks, 1)).outcome == "done"
+        await bench.until(lambda: bench.jobs("done: failed"))
+    assert bench.lines()[-1].kind is AlarmKind.ORDERED
+    assert await bench.desk.due() is None
+
+
 async def test_only_an_alarm_that_is_there_is_searched_and_only_by_a_full_campaign(bench: Bench) -> None:
     bench.store.alarms.append("mill-7", None, 0, AlarmKind.RAISED, RAISED, [])
     bench.store.alarms.append("mill-7", 1, 1, AlarmKind.CLEARED, RAISED, [])
