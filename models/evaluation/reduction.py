@@ -103,10 +103,10 @@ class Expansion:
 
 @dataclass(frozen=True, slots=True)
 class DiagonalExpansion:
-    """Expansion along a diagonal: of its axes, each with the square of its direction cosine.
+    """Expansion along a diagonal: the sum over its axes, each weighted by its squared direction cosine.
 
-    ``axes``: in order; ``shares``: squared direction cosines, which sum to 1. The laser is one and the same. Errors of the scales'
-    temperatures are independent; errors of their coefficients add up, since scales of one make have one coefficient.
+    ``axes``: expansion of each axis; ``shares``: the weights, in the same order, which sum to 1. One laser measures all axes. Errors of
+    the scales' temperatures are independent; errors of their coefficients add up, since scales of one make have one coefficient.
     """
 
     axes: tuple[Expansion, ...]

@@ -33,11 +33,10 @@ class LeftOut:
 
 @dataclass(frozen=True, eq=False)
 class Standstill:
-    """Result of a test; ``response`` and ``left_out`` belong to the model that predicts better.
+    """Result of a test at standstill. Two models compete: one of absolute temperatures, one of their changes since the start of each run.
 
-    ``since_start``: that model uses changes of temperature since the start of each run, otherwise it uses absolute temperatures.
-    ``shift_absolute``, ``shift_since_start``: an offset of some runs that the model with absolute temperatures, or with changes, does not
-    explain; None: no such offset.
+    ``since_start``: the model of changes predicts better; ``response``, ``left_out``: of the better model; ``shift_absolute``,
+    ``shift_since_start``: offset of some runs that the one or the other model does not explain, None without such an offset.
     """
 
     since_start: bool

@@ -178,7 +178,10 @@ def _axis_table(file: TextFile, data: _Data, axis: int, settings: FormatSettings
 
 
 def _sums(file: TextFile, data: _Data, first: int, last: int, reference: int, at_reference: float) -> F1:
-    """Return the sums of the points, one more than there are points, in units; ``at_reference`` is the sum at the reference position."""
+    """Add up points ``first`` to ``last`` of a set into the correction at each position, in units of the control.
+
+    There is one position more than points. ``at_reference``: the correction at the point with the number ``reference``.
+    """
     for n in range(first, last + 1):
         if n not in data.point:
             raise file.wrong(1, f"point {n} is missing: the control keeps its old value")

@@ -28,8 +28,8 @@ NOT_SENSED = "; the third direction was not sensed"
 
 
 def artefact_lines(joint: JointSolution) -> list[str]:
-    """Return the errors that the poses of an artefact hide, the pose that would show them, their share of the named fields, and a separate
-    fit of every workpiece."""
+    """Return sentences: errors that the poses of an artefact hide, and the pose that would show them; how the named error fields split into
+    artefact and machine; a fit of every workpiece by itself."""
     rank = pose_rank(joint.data)
     poses = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
     return poses + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]

@@ -57,7 +57,7 @@ class StoredField:
         lost = [name for name in wanted if name in self.hidden]
         if lost:
             raise NotObservable(
-                f"{', '.join(lost)}: solution {self.number} does not show it by itself ({self.hidden[lost[0]]})",
+                f"solution {self.number} cannot separate {', '.join(lost)} from other motions ({self.hidden[lost[0]]})",
                 "leave it out, or ask for all motions together",
             )
         return [name for name in self.motions if name in wanted]

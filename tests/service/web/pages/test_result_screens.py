@@ -69,7 +69,7 @@ def test_a_motion_that_does_not_show_by_itself_is_asked_for_in_vain(running: Ser
     with as_user(running, "vera") as client:
         answer = client.get(f"/api/v1/solutions/{number}/field", params={"motion": [observed(running), lost]})
         assert (answer.status_code, answer.json()["code"]) == (409, "SOL-001")
-        assert answer.json()["detail"].startswith(f"{lost}: solution {number} does not show it by itself")
+        assert answer.json()["detail"].startswith(f"solution {number} cannot separate {lost} from other motions")
         for wrong in ({"motion": "EQX"}, {"nodes": 1}, {"nodes": 10}):
             assert client.get(f"/api/v1/solutions/{number}/field", params=wrong).status_code == 422
         assert client.get("/api/v1/solutions/999/field").status_code == 404
