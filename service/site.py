@@ -12,7 +12,7 @@ import numpy as np
 from abbe.models.machine import AXES, Machine
 from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import MachineFile
-from abbe.service.domain.machine import AxisMaterial, DeviceUrls, control_of
+from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, control_of
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings
@@ -100,4 +100,21 @@ def site_of(config: MachineFile) -> Site:
         limits.two_people,
         config.material.by_axis(),
         limits.room_temperature_c,
+    )
+
+
+def rules_of(config: MachineFile | None) -> Rules:
+    """Limits of the check, certificates, allowed temperature and expansion from a machine file; empty without a file."""
+    if config is None:
+        return Rules()
+    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    materials = config.material.by_axis()
+    return Rules(
+        limits,
+        config.calibration.until(),
+        config.limits.temperature_c,
+        materials,
+        config.calibration.identities(),
+        config.issuer,
+        config.item,
     )

@@ -34,8 +34,6 @@ from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.identification.artefact_answer import deviation_of_artefacts, touched_boxes_mm, unsensed_axis
 from abbe.service.identification.removal import CampaignTable, RemovedEffects, remove_effects
 from abbe.service.identification.solve import Solved, beyond_the_prior, solve_runs
-from abbe.service.identification.solve_report import assess, solution_doc
-from abbe.service.identification.solve_tables import scale_free
 from abbe.service.push.validate import Candidate, CandidateContext, Column, EvidenceSeal, TableEvidence, content_digest, reasons_against
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.coverage import reached_mm
@@ -227,6 +225,8 @@ async def make(  # noqa: PLR0913 - every one of them is a choice of the caller, 
     ``agree`` receives the prediction; if it raises, nothing is stored. ``by``: the proposer; default: the account of this process.
     ``without_scale``: as for `propose`.
     """
+    from abbe.service.identification.solve_report import solution_doc  # here and below: an idle service writes no solution
+
     clock = clock or SystemClock()
     progress(Progress("solve", 0.0, 1.0, None, "21 error motions with all set-up errors"))
     name, base, form = gathered.campaign.name, gathered.base, gathered.form
@@ -280,6 +280,9 @@ def change_of(solved: Solved, *, without_scale: bool = False) -> tuple[NineTable
     if not without_scale:
         change = nine_tables(solved.joint, GRID)
         return change, predict_residual(solved.joint, change), ()
+    from abbe.service.identification.solve_report import assess
+    from abbe.service.identification.solve_tables import scale_free
+
     free = scale_free(assess(solved))
     sources, text = free.sources, SCALE_TEXTS[free.left_out or "common"]
     change = nine_tables(sources.solution, GRID, sources=sources)

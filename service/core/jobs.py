@@ -22,11 +22,10 @@ from abbe.service.clock import Clock
 from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.schedule import Schedule
-from abbe.service.jobs.guided_campaign import is_full
 from abbe.service.scheduler.job import Job, carry_out
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.recipes.campaigns import split_recipe_name
+from abbe.service.sequences.recipes.campaigns import is_full, split_recipe_name
 from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.jobs")

@@ -26,17 +26,16 @@ from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobKind, JobOutcome
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, NotStored, TableRefused
-from abbe.service.jobs.guided_campaign import is_full
-from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler.alarm_manager import AlarmManager
 from abbe.service.scheduler.job import Job, failure
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.recipes.campaigns import is_full
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, reconciled
 from abbe.service.users.roles import ALLOWED, Permission, Role
-from abbe.service.verification.alarm_states import Alarm
+from abbe.service.verification.alarm_states import Alarm, Note
 
 log = structlog.get_logger("abbe.orders")
 CAMPAIGN: Final = "campaign"

@@ -19,20 +19,14 @@ from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import TableMismatch, TableRefused
-from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, Note, investigate, make_proposal, plan_for, promise_text
+from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, investigate, make_proposal, plan_for, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
-from abbe.service.sequences.recipes.campaigns import IDENTIFICATION, USUAL_HZ, RecipeSource, split_recipe_name
+from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.tables.nine_tables import read_base
-from abbe.service.verification.alarm_states import Alarm
+from abbe.service.verification.alarm_states import Alarm, Note
 
 SOLVING = "the measurement is complete, and nothing moves while it is solved"
-
-
-def is_full(recipe: str, names: tuple[str, ...]) -> bool:
-    """Return whether a recipe is one of the full campaigns ``names``. Only the built-in one takes a ball-bar rate; a file sets its own."""
-    name, rate_hz = split_recipe_name(recipe)
-    return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
 
 async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:

@@ -42,15 +42,12 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from abbe.service.verification.alarm_states import TRIES, Alarm, next_step
+from abbe.service.verification.alarm_states import TRIES, Alarm, Note, next_step
 
 BESIDE = 0.5
 """Largest ratio of the unexplained readings to the gain that tables promise; above it, a remedy other than tables comes first."""
 REFUSALS = (TableRefused, TableMismatch, CampaignRefused, NotObservable)
 """Errors that end an investigation with an answer: they become the alarm's text, because another try would end in the same way."""
-
-Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
-"""Writes a line of the alarm; returns the alarm including it."""
 
 
 @dataclass(frozen=True)

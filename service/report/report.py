@@ -13,7 +13,6 @@ import numpy as np
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
-from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine import Rules
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
@@ -281,23 +280,6 @@ def _sizes(tables: NineTables | None) -> list[ReportFigure]:
 
 
 NUMBERED = ("push", "discovery", "verification")
-
-
-def rules_of(config: MachineFile | None) -> Rules:
-    """Limits of the check, certificates, allowed temperature and expansion from a machine file; empty without a file."""
-    if config is None:
-        return Rules()
-    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
-    materials = config.material.by_axis()
-    return Rules(
-        limits,
-        config.calibration.until(),
-        config.limits.temperature_c,
-        materials,
-        config.calibration.identities(),
-        config.issuer,
-        config.item,
-    )
 
 
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:

@@ -19,7 +19,6 @@ from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
-from abbe.service.jobs.investigate import Note
 from abbe.service.scheduler.job import FollowUp, Job, failure
 from abbe.service.scheduler.ports import Doc, SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
@@ -27,7 +26,7 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification import verify
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm, folded, step_alone
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note, folded, step_alone
 from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, alarms_of, check_facts, evaluate_alarm, last_seq
 
 log = structlog.get_logger("abbe.alarm")

@@ -8,12 +8,12 @@ time, in which it does not ask for attention (ISA-18.2, IEC 62682).
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass, replace
 from datetime import datetime
 from typing import Literal
 
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind, Signal
+from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind, Signal
 
 OF_WORK = (
     AlarmKind.ORDERED,
@@ -101,6 +101,10 @@ class Alarm(AlarmHead):
     def outcome(self) -> str:
         """Latest result of the work on the alarm as a sentence; empty without any."""
         return self.work[-1].facts.text if self.work else ""
+
+
+Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
+"""Writes a line of the alarm; returns the alarm including it."""
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:

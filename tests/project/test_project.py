@@ -211,6 +211,14 @@ def test_an_idle_service_holds_no_library_of_mathematics() -> None:
     assert not {"scipy.linalg", "scipy.optimize", "scipy.sparse", "scipy.spatial", "scipy.special", "scipy.stats"} & loaded
 
 
+def test_an_idle_core_holds_nothing_that_answers_alarms() -> None:
+    """What solves, searches, proposes and draws comes with the first campaign: 5 MB less."""
+    loaded = modules("-c", "import abbe.service.serve, abbe.service.compensation.push_approved")
+    assert "abbe.service.core.orders" in loaded
+    seldom = {"abbe.service.jobs.investigate", "abbe.service.jobs.guided_campaign", "abbe.service.discovery.discover"}
+    assert not {*seldom, "abbe.models.uncertainty.monte_carlo", "abbe.service.report.report"} & loaded
+
+
 def test_every_row_of_what_you_own_names_a_test_that_exists() -> None:
     lines = (ROOT / "docs" / "how-to" / "what-you-own.md").read_text(encoding="utf-8").splitlines()
     rows = [line for line in lines if line.startswith("| ") and not line.startswith("| you own")]

@@ -24,7 +24,6 @@ if TYPE_CHECKING:
     from abbe.service.domain.job_state import JobOutcome
     from abbe.service.domain.progress import ProgressSink
     from abbe.service.domain.verification import CheckResult
-    from abbe.service.jobs.investigate import Note
     from abbe.service.mqtt.broker import Broker
     from abbe.service.scheduler.alarm_manager import Duties
     from abbe.service.scheduler.ports import Check
@@ -32,7 +31,7 @@ if TYPE_CHECKING:
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import Site
     from abbe.service.storage.store import Store
-    from abbe.service.verification.alarm_states import Alarm
+    from abbe.service.verification.alarm_states import Alarm, Note
 
 
 LONGEST_NAME = 180
@@ -80,12 +79,11 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.core.table_watch import look_at_table
     from abbe.service.jobs.check import run_check
     from abbe.service.mqtt.broker import Topics
-    from abbe.service.report.report import rules_of
     from abbe.service.scheduler.ready import Ready, look_at
     from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.sequences.recipes.campaigns import RECIPES, campaign_source
     from abbe.service.sequences.steps import CampaignPlan
-    from abbe.service.site import site_of
+    from abbe.service.site import rules_of, site_of
 
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)
@@ -178,13 +176,14 @@ def duties_on(
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.push_approved import push_approved
-    from abbe.service.jobs.investigate import InvestigationContext, investigate
     from abbe.service.scheduler.alarm_manager import Duties
 
     def duties(store: Store) -> Duties:
         clock = SystemClock()
 
         async def look_into(one: Alarm, note: Note, progress: ProgressSink, control: Control) -> None:
+            from abbe.service.jobs.investigate import InvestigationContext, investigate  # an idle service solves and searches nothing
+
             await investigate(InvestigationContext(site, store, plan, clock, progress, control, live), one, note)
 
         async def push(order: PushOrder) -> JobOutcome:
@@ -224,12 +223,13 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
     """
     from abbe.service.clock import SystemClock
     from abbe.service.domain.job_state import JobOutcome
-    from abbe.service.jobs.guided_campaign import investigate_guided, named_now, run_guided_campaign
-    from abbe.service.jobs.investigate import InvestigationContext
     from abbe.service.sequences.recipes.campaigns import campaign_source
 
     def on(store: Store) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> JobOutcome:
+            from abbe.service.jobs.guided_campaign import investigate_guided, named_now, run_guided_campaign
+            from abbe.service.jobs.investigate import InvestigationContext
+
             source = campaign_source(order.recipe, folder)
             plan = source.plan(site.machine)
             context = InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live)

@@ -66,7 +66,8 @@ def report(  # noqa: PLR0913 - one argument for each option
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.rendering.document_page import default_name, form_of, write_document
-    from abbe.service.report.report import NUMBERED, certified, rules_of
+    from abbe.service.report.report import NUMBERED, certified
+    from abbe.service.site import rules_of
     from abbe.service.verification.reduction import AT_20, DIAGONAL_AT_20
 
     for target in out or []:

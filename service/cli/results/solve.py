@@ -246,8 +246,9 @@ def _write_report(
     from abbe.service.config import load_machine
     from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.rendering.document_page import write_document
-    from abbe.service.report.report import rules_of, solution_report
+    from abbe.service.report.report import solution_report
     from abbe.service.report.report_measured import SolutionResult
+    from abbe.service.site import rules_of
 
     solution = SolutionFile.read(doc)
     rules = rules_of(None if machine is None else load_machine(machine).machine)

@@ -191,6 +191,12 @@ def split_recipe_name(name: str) -> tuple[str, int]:
     return found["name"], int(found["rate"])
 
 
+def is_full(recipe: str, names: tuple[str, ...]) -> bool:
+    """Return whether a recipe is one of the full campaigns ``names``. Only the built-in one takes a ball-bar rate; a file sets its own."""
+    name, rate_hz = split_recipe_name(recipe)
+    return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
+
+
 def recipe_plan(name: str, machine: Machine) -> CampaignPlan:
     """Return the plan of a built-in recipe; ``NAME at 500 Hz`` sets the ball-bar rate. Raises ConfigError for an unknown recipe."""
     recipe, rate_hz = split_recipe_name(name)

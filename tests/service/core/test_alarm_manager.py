@@ -29,7 +29,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import StillActive, StoreError, TableRefused
 from abbe.service.jobs.investigate import InvestigationContext as Investigation
-from abbe.service.jobs.investigate import Note, investigate
+from abbe.service.jobs.investigate import investigate
 from abbe.service.push.journal import StoreBook
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
 from abbe.service.scheduler.job import carry_out
@@ -40,7 +40,7 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView, reconciled
 from abbe.service.users.roles import Permission
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, utc

@@ -21,7 +21,6 @@ from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import AlarmRefused, StoreError
-from abbe.service.jobs.investigate import Note
 from abbe.service.push.journal import GENESIS
 from abbe.service.queries.status import alarms
 from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager, Duties
@@ -30,7 +29,7 @@ from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
-from abbe.service.verification.alarm_states import NO_ALARM, Alarm
+from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note
 from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, series_begins
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
 
