@@ -258,7 +258,10 @@ class ChangeContext:
         return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
-        """Return `_beside` of the chosen changes and of all scales and squareness errors, candidate ``but`` left out."""
+        """Factor of the covariance of all unknowns if all scales and squareness errors may change, too, but not candidate ``but``.
+
+        Shape (p, k), as in `_beside`.
+        """
         others = [t for t in chosen.taken if t.asked.name != but]
         names = {but, *(t.asked.name for t in others)}
         linear = [TakenChange(a, 0.0, 0.0, ()) for a in self.candidates if not a.several and a.name not in names]

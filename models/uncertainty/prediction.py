@@ -259,7 +259,10 @@ def _factors(sources: ErrorSources) -> list[F2]:
 
 
 def _together(sources: ErrorSources, propagated: F4) -> tuple[F3, F3]:
-    """Covariance of points, shape (m, 3, 3), and variance by source, (sources, m, 3), from the covariances by factor (`_factors`)."""
+    """Sum over all sources: covariance of m points, shape (m, 3, 3), and variance by source, shape (sources, m, 3).
+
+    ``propagated``: covariance of the points due to each of the `_factors`.
+    """
     count = len(sources.sources)
     subtracted = iter(propagated[count:])
     covariance = np.zeros(propagated.shape[1:])

@@ -102,7 +102,7 @@ class ProgressReporter:
             self._waits_since_s = None
 
     def skip(self, duration_s: float) -> None:
-        """Add planned time of tests that were complete before this job began; the ETA ignores it."""
+        """Count a test that was complete before this job began as done; the pace that gives the ETA does not use its planned time."""
         self.done_s += duration_s
         self.skipped_s += duration_s
 

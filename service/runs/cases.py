@@ -69,7 +69,7 @@ def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Case
 
 
 def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Path:
-    """Return the path of a run, without its readings."""
+    """Return what a simulation needs to know of a run: positions, times, mounting and temperatures, but no readings."""
     setup, t_s, q = run.setup, run.columns.t_s, run.columns.q_mm
     temp = run.columns.temperatures_c
     first = {s: v[:1] for s, v in temp.items()}

@@ -65,7 +65,7 @@ class _Overview:
 
 @lru_cache(64)
 def _overview(store: Store, number: int, samples: int) -> _Overview:
-    """A run without its readings, which are large: who comes back to one of the last runs does not wait. ``samples``: it has so far."""
+    """Overview of a run, cached for runs shown lately. ``samples``: their number so far; a new number makes a new overview."""
     t_s, deviation_mm = _readings(store, number, samples)
     if not len(t_s):
         return _Overview((t_s, t_s, t_s), (0.0, 0.0), 0)
