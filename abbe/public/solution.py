@@ -162,8 +162,8 @@ def solve(
     Parameters
     ----------
     model : str, optional
-        ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: the model that predicts held-out runs
-        best. None: rigid21, or rigid6 with a flag if the readings are too few.
+        ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: the model that predicts left-out
+        set-ups and regions of the volume best. None: rigid21, or rigid6 with a flag if the readings are too few.
     progress : callable, optional
         Receives one line of text per stage.
 

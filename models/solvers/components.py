@@ -1,8 +1,8 @@
-"""Variance components and order of the model, estimated from the readings.
+"""Variance components, estimated from the readings.
 
-The components are the noise of the instruments and the typical size of each class of errors; the order is the number of Legendre orders
-that held-out runs support. A campaign is compressed to normal equations of the unknowns, per fold and instrument (`InformationSums`), so
-later work depends on the number of unknowns (a few hundred) and not of readings.
+The components are the noise of the instruments and the typical size of each class of errors. A campaign is compressed to normal equations
+of the unknowns, per fold and instrument (`InformationSums`), so later work depends on the number of unknowns (a few hundred) and not of
+readings.
 
 The method is the marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher
 scoring on the logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". The uncertainty of the components widens the
@@ -19,8 +19,6 @@ import scipy
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.geometry.bases import SMOOTH_ORDER, Term
-from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import ENDS_SHARES, LENGTHS, SMALLEST_BEND, SizeModel, with_shapes
 
 I1 = NDArray[np.int64]
@@ -39,9 +37,6 @@ TOLERANCE = 0.02
 """Gain in log evidence below which the estimation of the components stops."""
 LARGEST_STEP = 1.5
 HALVINGS = 6
-FOLDS = 8
-RIGID6 = 0
-"""Level of the model with three scales and three squareness errors only."""
 
 
 @dataclass(frozen=True)
@@ -331,10 +326,15 @@ def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> t
     return models[at], found[at]
 
 
-def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Components]:
+ROUGH_CAUTION = 0.2
+"""Share of the widening by `cautious` that counts in U of a rough machine. Its rough parts take up what the shapes of the smooth prior do
+not follow; with all of it U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps all of it: it costs a map nothing."""
+
+
+def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> tuple[SizeModel, Components]:
     """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    It differs in two ways, none of which matters with many readings.
+    It differs in two ways, none of which matters with many readings; ``share`` of the first counts.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
       that the readings hardly separate, the most probable sizes are too small. Without information it is at most the documented one.
@@ -343,107 +343,13 @@ def cautious(model: SizeModel, found: FittedComponents) -> tuple[SizeModel, Comp
     rough = np.array([name.startswith("smoothness ") for name in model.names])
     sd = np.sqrt(found.spread.diagonal()[: rough.size])
     psi = found.components.psi
-    psi = psi + np.where(np.array(model.names) == "slope", np.clip(-psi, 0.0, 0.5 * sd**2), 0.0)
+    psi = psi + np.where(np.array(model.names) == "slope", share * np.clip(-psi, 0.0, 0.5 * sd**2), 0.0)
     c = Components(np.clip(psi, model.low, model.high), found.components.eta)
     sizes = model.design * ~rough
     unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
     factor = np.ones(model.typical.size)
     for at in model.blocks:
-        scale = np.minimum(np.exp(0.25 * unsure[at]), np.maximum(1.0 / c.half(model)[at], 1.0))
+        scale = np.minimum(np.exp(0.25 * share * unsure[at]), np.maximum(1.0 / c.half(model)[at], 1.0))
         prior_size = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
         factor[at] = scale * np.hypot(prior_size, SMALLEST_BEND) / prior_size
     return replace(model, root=model.root * factor), c
-
-
-@dataclass(frozen=True)
-class OrderChoice:
-    """Score of every model on held-out readings.
-
-    ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold minus that of the best
-    level. ``se``: standard error of this difference over the folds. ``chosen``: the simplest level within one standard error of the best.
-    """
-
-    levels: tuple[int, ...]
-    score: F1
-    se: F1
-    chosen: int
-
-
-def folds(runs: tuple[RunData, ...]) -> I1:
-    """Fold of each run, shape (runs,): all runs of a set-up share a fold, and each instrument is spread evenly over the folds."""
-    out = np.zeros(len(runs), dtype=np.int64)
-    place: dict[str, int] = {}
-    for kind in KINDS:
-        for run in runs:
-            if run.kind == kind and run.setup not in place:
-                place[run.setup] = len(place) % FOLDS
-    for i, run in enumerate(runs):
-        out[i] = place[run.setup]
-    return out
-
-
-def term_levels(terms: tuple[Term, ...], rest: int) -> I1:
-    """Lowest level whose model contains each unknown, shape (p,); -1 for lost motion and set-up, which every model has."""
-    own = [
-        RIGID6 if t.order == 0 or (t.order == 1 and t.component == t.axis) else t.order if t.order <= SMOOTH_ORDER else -1 for t in terms
-    ]
-    return np.array(own + [-1] * rest, dtype=np.int64)
-
-
-def truncated_evidence(sums: InformationSums, c: Components, model: SizeModel, level: I1) -> tuple[tuple[int, ...], F1]:
-    """Levels, and the log evidence of the model truncated at each; constants that all levels share are left out.
-
-    A truncated model has no Legendre coefficients above its level; the others keep their prior covariance.
-    """
-    levels = tuple(int(v) for v in np.unique(level[level >= 0]))
-    w = np.exp(-c.eta)
-    root = model.root * c.half(model)
-    gram, rhs, fixed = _without_setup(np.tensordot(w, sums.gram, 1), w @ sums.rhs, root, level)
-    at = np.flatnonzero(level >= 0)
-    covariance = root[at] @ root[at].T
-    out = []
-    for k in levels:
-        keep = np.flatnonzero(level[at] <= k)
-        low = scipy.linalg.cholesky(covariance[np.ix_(keep, keep)], lower=True, check_finite=False)
-        inside = low.T @ gram[np.ix_(keep, keep)] @ low
-        np.fill_diagonal(inside, inside.diagonal() + 1.0)
-        factor = scipy.linalg.cholesky(inside, lower=True, check_finite=False)
-        z = scipy.linalg.solve_triangular(factor, low.T @ rhs[keep], lower=True, check_finite=False)
-        out.append(fixed + 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum()))
-    return levels, np.array(out)
-
-
-def _without_setup(gram: F2, rhs: F1, root: F2, level: I1) -> tuple[F2, F1, float]:
-    """Normal equations of the smooth terms with lost motion and set-up integrated out, and the log evidence of that part."""
-    terms, rest = np.flatnonzero(level >= 0), np.flatnonzero(level < 0)
-    own = root[np.ix_(rest, rest)]
-    turn = own.T @ gram[rest]
-    inside = turn[:, rest] @ own
-    np.fill_diagonal(inside, inside.diagonal() + 1.0)
-    factor = scipy.linalg.cholesky(inside, lower=True, check_finite=False)
-    both = np.column_stack([turn[:, terms], own.T @ rhs[rest]])
-    half = scipy.linalg.solve_triangular(factor, both, lower=True, check_finite=False)
-    z = half[:, -1]
-    fixed = 0.5 * float(z @ z) - float(np.log(factor.diagonal()).sum())
-    return gram[np.ix_(terms, terms)] - half[:, :-1].T @ half[:, :-1], rhs[terms] - half[:, :-1].T @ z, fixed
-
-
-def choose(parts: tuple[InformationSums, ...], c: Components, model: SizeModel, level: I1) -> OrderChoice:
-    """Score all levels on held-out folds (their set-up unknowns integrated out); with fewer than 3 folds, by evidence.
-
-    log p(held-out | others) = log p(all) - log p(others). Sizes and noise come from all readings; the unknowns themselves are estimated
-    without the fold on which they are scored.
-    """
-    whole = total(parts)
-    levels, everything = truncated_evidence(whole, c, model, level)
-    used = [s for s in parts if s.count.sum() > 0]
-    if len(used) < 3:
-        score = everything[None] - everything.max()
-    else:
-        score = everything - np.array([truncated_evidence(whole.minus(s), c, model, level)[1] for s in used])
-    mean: F1 = score.mean(axis=0)
-    best = int(np.argmax(mean))
-    difference: F2 = score - score[:, best : best + 1]
-    se = difference.std(axis=0, ddof=1) / np.sqrt(len(score)) if len(score) > 1 else np.zeros(len(levels))
-    good = [i for i in range(len(levels)) if mean[best] - mean[i] <= se[i]]
-    return OrderChoice(levels, mean - mean[best], np.asarray(se), levels[good[0]])

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term
@@ -14,6 +15,7 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.components import (
     I1,
     KINDS,
+    ROUGH_CAUTION,
     ComponentPosterior,
     Components,
     Grams,
@@ -23,7 +25,6 @@ from abbe.models.solvers.components import (
     cautious,
     estimate,
     fit_shapes,
-    folds,
     grams,
     posterior,
     sums,
@@ -32,6 +33,7 @@ from abbe.models.solvers.components import (
 from abbe.models.solvers.details import with_details
 from abbe.models.solvers.observations import RunData, nominal_reading
 from abbe.models.solvers.observe import SetupUnknowns, predict, run_design, setup_unknowns
+from abbe.models.solvers.order_choice import folds
 from abbe.models.solvers.priors import Priors, SizeModel, size_model
 from abbe.models.solvers.residuals import inflation, leverage, outlier_threshold, outlier_weights, robust_scale
 
@@ -236,7 +238,10 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
 
 
 def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Grams) -> CampaignFit:
-    """Solve a last time with the exact residuals; correlated neighbours count as fewer readings."""
+    """Solve a last time with the exact residuals; correlated neighbours count as fewer readings.
+
+    The estimate is that of the cautious prior. The covariance of a rough machine is that of a narrower one (`ROUGH_CAUTION`).
+    """
     r, typical = problem.readings, problem.sizes.typical
     residual = problem.measured - problem.predicted(typical * x)
     z = residual / problem.sigma + r.a @ x
@@ -247,13 +252,33 @@ def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Gr
     whole = total(parts)
     sizes = problem.sizes
     found = estimate(whole.turned(sizes.root, sizes.turned), sizes, c)
-    sizes, c = cautious(sizes, found)
-    p = posterior(whole.turned(sizes.root, sizes.turned), c, sizes)
-    root = typical[:, None] * sizes.root * c.half(sizes)
+    p, root, sizes, c = _solved(whole, *cautious(sizes, found))
+    theta = typical * (root @ p.x)
+    if problem.sizes.rough and not any(run.kind == "artefact" for run in problem.runs):
+        p, root, sizes, c = _solved(whole, *cautious(problem.sizes, found, ROUGH_CAUTION))
+    root = typical[:, None] * root
     cov = root @ p.cov @ root.T
-    theta = root @ p.x
     left = problem.measured - problem.predicted(theta)
     return CampaignFit(theta, cov, np.linalg.norm(root, axis=1), sizes, c, p, weight, size, left, decimation, parts)
+
+
+def _solved(whole: InformationSums, sizes: SizeModel, c: Components) -> tuple[ComponentPosterior, F2, SizeModel, Components]:
+    """Posterior, and the root of the prior in units of the typical sizes."""
+    return posterior(whole.turned(sizes.root, sizes.turned), c, sizes), sizes.root * c.half(sizes), sizes, c
+
+
+def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) -> InformationSums:
+    """Normal equations of some readings of the converged solution, to be taken off those of all (`InformationSums.minus`)."""
+    r = problem.readings
+    a, kind, weight = r.a[rows], r.kind[rows], fit.weight[rows] / fit.decimation[r.kind[rows]]
+    y = fit.residual_mm[rows] / problem.sigma[rows] + a @ (fit.theta / problem.sizes.typical)
+    each = [(a[at], y[at], weight[at]) for at in (kind == k for k in range(len(KINDS)))]
+    return InformationSums(
+        np.array([(b * w[:, None]).T @ b for b, _, w in each]),
+        np.array([(w * z) @ b for b, z, w in each]),
+        np.array([float(w @ z**2) for _, z, w in each]),
+        np.array([float(w.sum()) for _, _, w in each]),
+    )
 
 
 def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:

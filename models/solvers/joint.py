@@ -20,7 +20,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, SMOOTH_ORDER, Term, rough_terms, smooth_terms, term_motions
 from abbe.models.geometry.field import field_mm
 from abbe.models.machine import Machine, with_tool
-from abbe.models.solvers.components import KINDS, RIGID6, OrderChoice, choose, term_levels, total
+from abbe.models.solvers.components import KINDS, total
 from abbe.models.solvers.engine import (
     CampaignFit,
     CampaignProblem,
@@ -30,12 +30,14 @@ from abbe.models.solvers.engine import (
     expected_noise,
     rough_evidence,
     settle,
+    sums_of,
 )
 from abbe.models.solvers.fine import refined
 from abbe.models.solvers.least_squares import Identifiability, ParameterEstimate, combinations_of, taking_part
 from abbe.models.solvers.observability.rank import campaign_columns, compressed, hidden_free, observed_information, stated_knowledge
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import SetupUnknowns
+from abbe.models.solvers.order_choice import RIGID6, OrderChoice, choose, regions, term_levels
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
@@ -88,7 +90,7 @@ class JointSolution:
     outliers : down-weighted readings, largest first.
     residual_tests : tests of the whitened residuals per run.
     model : "rigid6" or "rigid21"
-    order_choice : scores of all orders on held-out runs; None when the caller chose.
+    order_choice : scores of all orders on left-out set-ups (model "auto": and regions); None when the caller chose.
     size_factors : dict
         Ratio of estimated to documented typical size for each class of unknowns; ``length``: correlation length, strokes.
     table_factor : array, shape (p, k), or None
@@ -198,7 +200,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         Highest Legendre order of the error motions. Default: chosen by held-out runs, with higher orders up to 12 as nuisance. If given,
         there are no terms above it, so the uncertainties hold only for a machine of that order.
     model : "rigid6", "rigid21" or "auto"
-        Three scales and three squareness errors; 21 error motions; or the six where held-out runs do not support more.
+        Three scales and three squareness errors; 21 error motions; or the six where left-out set-ups and regions do not support more.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Start values of the estimated noise: standard uncertainty of one raw reading, and least one of an averaged value. Default: from
         repeats, and the resolution.
@@ -228,9 +230,12 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         report("the readings show error motions that are rough")
         terms = (*terms, *rough_terms())
         problem, fit = _again(machine, terms, problem.runs, priors or Priors(), noise, report)
-    choice = choose(fit.parts, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
+    left_out = fit.parts
+    if model == "auto":
+        left_out = (*left_out, *(sums_of(problem, fit, rows) for rows in regions(problem.runs)))
+    choice = choose(total(fit.parts), left_out, fit.components, fit.sizes, term_levels(terms, len(problem.names) - len(terms)))
     if model == "auto" and choice.chosen == RIGID6:
-        report("held-out runs support only scales and squareness")
+        report("left-out set-ups and regions support only scales and squareness")
         six = build(machine, _six(), runs, priors or Priors(), noise)
         return _solution(six, settle(six, report), "rigid6", 1, choice)
     chosen = order or max(choice.chosen, 1)

@@ -56,7 +56,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         ModelName | None,
         typer.Option(
             "--model",
-            help="rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: held-out runs decide. "
+            help="rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: left-out set-ups and regions decide. "
             "Default: rigid21, or rigid6 if the readings are too few.",
             show_default=False,
         ),

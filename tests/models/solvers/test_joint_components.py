@@ -76,6 +76,10 @@ def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nano
     assert known[large] == pytest.approx(before[large], rel=1e-3)
     assert (unknown[large] > 1.1 * known[large]).all()
     assert (unknown[rest] == before[rest]).all()
+    model_02, c_02 = cautious(model, FittedComponents(small, 0.5 * np.eye(h + 2), 0.0), 0.2)
+    part = np.linalg.norm(model_02.root * c_02.half(model_02), axis=1)
+    assert (part[large] > 1.01 * known[large]).all()  # a share of the widening is a share of its logarithm
+    assert (part[large] < unknown[large]).all()
 
 
 def test_an_error_motion_is_at_most_twice_as_large_at_the_ends_as_in_the_middle():

@@ -8,7 +8,6 @@ import pytest
 from abbe.models.geometry.bases import SMOOTH_ORDER
 from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.models.solvers import engine
-from abbe.models.solvers.components import folds
 from abbe.models.solvers.engine import repeat_noise_mm
 from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import RunData
@@ -107,13 +106,6 @@ def six_machine(runs, seed):
 
 def test_auto_takes_six_parameters_where_six_are_enough(runs):
     assert solve_joint(MACHINE, six_machine(runs, 3), model="auto").model == "rigid6"
-
-
-def test_set_ups_are_held_out_whole(runs):
-    shared = tuple(replace(r, setup="same") if r.label in ("h0", "h1") else r for r in runs)
-    f = folds(shared)
-    assert f[0] == f[1]
-    assert len(set(f.tolist())) >= 3
 
 
 def test_progress_is_told(runs):
