@@ -146,7 +146,10 @@ class Contest:
 
     @classmethod
     def of(cls, problem: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
-        """Set up a search over all starts of all mean effects that the present simulation does not contain."""
+        """Set up a search for all effects on the mean of the readings that the present simulation lacks.
+
+        Each effect is tried with every combination of its start values (`starts_of`).
+        """
         rivals = competing(effects, problem.case.includes)
         bank = bank_of(problem, starts_of([e for e in rivals if not e.beside]))
         widths = {p.label: float(k) for p, k in zip(bank.picks, bank.logs, strict=True)}

@@ -175,7 +175,7 @@ def _told(lang: str, value: Any, key: str = "", head: Any = None) -> Any:
 
 
 def _certificate(lang: str, text: str) -> str:
-    """What a person wrote about an instrument's certificate, and its last day in a language."""
+    """Translate a note on an instrument's certificate: a person's words stay as they are, the phrase on its expiry is put into ``lang``."""
     written, mark, ours = text.rpartition("; ")
     return written + mark + phrase(lang, ours)
 

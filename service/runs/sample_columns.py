@@ -84,7 +84,10 @@ def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunCl
 
 
 def _fits(chunks: Sequence[ChunkRecord], end: RunEnd, period_s: float) -> tuple[ClockFit, ClockFit] | str:
-    """Fit the box's and the controller's clock to this computer's. Return a text instead if one jumped, an empty one for too few pairs."""
+    """Fit the clocks of the box and of the controller to the clock of this computer.
+
+    Without a fit, returns the reason: a sentence if a clock jumped, an empty text if there are too few pairs.
+    """
     box = np.array([(c.last_device_us * 1e-6, c.last_host_s) for c in chunks], dtype=np.float64).reshape(-1, 2)
     cnc = np.array(end.clock_pairs, dtype=np.float64).reshape(-1, 2) * [1e-6, 1.0]
     for name, pairs in (("ball-bar's box", box), ("controller", cnc)):

@@ -89,7 +89,7 @@ class Readiness(Protocol):
         ...
 
     async def watch(self) -> None:
-        """Record the machine's state without end, for preconditions that need its history; return at once if there is none."""
+        """Record the machine's state forever if a precondition needs its history; otherwise return at once."""
         ...
 
 

@@ -346,7 +346,10 @@ def correlations(names: tuple[str, ...], covariance: F2) -> tuple[Correlation, .
 
 
 def hidden_terms(terms: tuple[Term, ...], null_space: F2) -> frozenset[str]:
-    """Coefficients that take part in a hidden combination; ``null_space``: orthonormal in unit columns, shape (p, k)."""
+    """Names of the coefficients that take part in a combination that the runs do not show.
+
+    ``null_space``: orthonormal basis of these k combinations, for columns scaled to length 1, shape (p, k).
+    """
     return taking_part(tuple(t.name for t in terms), null_space)
 
 
