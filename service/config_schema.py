@@ -46,6 +46,8 @@ Coefficient = Annotated[float, Field(ge=-1e-5, le=1e-4)]
 """Bounds of an expansion coefficient, 1/K: negative for some glass ceramics and fibres; a number in µm/m/K is above the largest."""
 CoefficientUncertainty = Annotated[float, Field(gt=0.0, le=1e-5)]
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
+ROOM_K = 1.0
+"""Widest range of a stated room: `abbe.service.verification.verify.SAME_AIR_C`."""
 MachineWindow = Annotated[Window, AfterValidator(complete)]
 EXCLUSIVE_KEYS = {
     "schedule": (("cron",), ("every_h", "first")),
@@ -153,11 +155,6 @@ class Limits(ConfigTable):
     )
     feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
     temperature_c: Temperatures = Field(default=(18.0, 24.0), description="permitted air temperature of a measurement")
-    room_temperature_c: Temperatures | None = Field(
-        default=None,
-        description="lowest and highest air temperature by the room's own record; it counts where no laser recorded one, for example in a "
-        "campaign with a probe. A table is verified only in a range of at most 1 K",
-    )
     run_temperature_c: Temperatures | None = Field(
         default=None, description="air temperature, read from the laser, outside which a running measurement stops; absent: not watched"
     )
@@ -266,10 +263,25 @@ class Calibration(ConfigTable):
         default=None, description="of the probed artefact's length; without a calibrated length, of the touch probe's test (ISO 230-10)"
     )
     artefact_is: str = Field(default="", max_length=400, description="the same for the artefact")
+    room: Certificate = Field(default=None, description="of room_temperature_c: until when it was confirmed for the room")
+    room_temperature_c: Temperatures | None = Field(
+        default=None,
+        description="lowest and highest air temperature by the room's own thermometer, at most 1 K apart; only for a machine without a "
+        "laser, whose sensor would read the air",
+    )
+
+    @model_validator(mode="after")
+    def _room(self) -> Self:
+        if (self.room is None) != (self.room_temperature_c is None):
+            raise ValueError("room and room_temperature_c belong together, expected both or neither")
+        if self.room_temperature_c is not None and self.room_temperature_c[1] - self.room_temperature_c[0] > ROOM_K + 1e-9:
+            low, high = self.room_temperature_c
+            raise ValueError(f"room_temperature_c is {low:g} to {high:g}, expected at most {ROOM_K:g} K: verifications need as much")
+        return self
 
     def until(self) -> dict[str, date]:
-        """Last days of the certificates that are stated, by instrument (`abbe.service.domain.run.Run.instrument`)."""
-        days = {"ballbar": self.ballbar, "laser": self.laser, "artefact": self.artefact}
+        """Last days of the certificates that are stated, by instrument (`abbe.service.domain.run.Run.instrument`), and of the room."""
+        days = {"ballbar": self.ballbar, "laser": self.laser, "artefact": self.artefact, "room": self.room}
         return {kind: day for kind, day in days.items() if day is not None}
 
     def identities(self) -> dict[str, str]:
@@ -493,6 +505,12 @@ class MachineFile(ConfigTable):
 
     @model_validator(mode="after")
     def _can_be_met(self) -> Self:
+        if (room := self.calibration.room_temperature_c) is not None:
+            low, high = self.limits.temperature_c
+            if self.devices.laser:
+                raise ValueError("room_temperature_c is stated beside a laser, expected one of both: its sensor reads the air")
+            if not low <= room[0] <= room[1] <= high:
+                raise ValueError(f"room_temperature_c is outside of [limits] temperature_c, expected inside {low:g} to {high:g}")
         for entry in self.schedule:
             if entry.needs.operator == "present" and not self.staffed:
                 raise ValueError(f"schedule {entry.name!r} needs an operator, expected [[staffed]] to say when one is there")

@@ -3,7 +3,7 @@
 By rule G a deviation is J m: the 18 error motions m, each a function of its own axis, times the levers J. On a grid the
 covariance of m therefore consists of blocks of 6 x 6 that depend on one or two of the three positions: they are computed once for each pair
 of lines, and a point needs only products with its levers. A rigid motion that is removed is a fourth block, which depends on no position.
-A point costs some microseconds; its design of hundreds of terms times the factor of every source costs a hundred.
+A point costs some microseconds; its design of hundreds of terms times the factor of every source costs ten times as much.
 """
 
 from __future__ import annotations
@@ -127,4 +127,7 @@ def _covariances(levers: F4, tables: dict[tuple[int, int], F4]) -> F4:
         carried = sum(levers[:, :, a] @ tables[a, b] for a in range(b + 1))
         total += np.reshape(carried, (rows, nz, 3 * size, 6)) @ np.swapaxes(levers[:, :, b], 2, 3)
     found = np.moveaxis(total.reshape(rows * nz, 3, size, 3), 2, 0)
-    return np.asarray(found + np.swapaxes(found, 2, 3))
+    whole = found + np.swapaxes(found, 2, 3)
+    variance = np.einsum("...ii->...i", whole)
+    np.maximum(variance, 0.0, out=variance)  # what a frame cancels may leave a rounding error below zero
+    return np.asarray(whole)

@@ -85,16 +85,25 @@ def _plain(values: Any) -> list[float]:
 
 def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     used = [r for r in runs if r.identifies]
-    air = [float(t) for r in used for t in r.columns.air_c] or list(site.room_c or ())
+    air = list(site.room_c or ()) if air_is_stated(site, runs) else [float(t) for r in used for t in r.columns.air_c]
     if not air or not np.isfinite(air).all():
         air = [float("nan")]
     p = promise.predicted
     drift = 0.0 if promise.drift_mm is None else promise.drift_mm
     return TableEvidence(
         len(used), promise.ended_s, (min(air), max(air)), drift, p.u_model_mm, p.before_mm, p.after_mm,
-        mark_of(r.table.boot_id for r in used), certified_until_s(site.calibrated_until, _instruments(used)),
+        mark_of(r.table.boot_id for r in used),
+        certified_until_s(site.calibrated_until, _instruments(used) | ({"room"} if air_is_stated(site, runs) else set())),
         promise.last_s, reached_mm(used),
     )  # fmt: skip
+
+
+STATED = "the air's temperature is not measured: a person stated that of the room (room_temperature_c)"
+
+
+def air_is_stated(site: Site, runs: list[Run]) -> bool:
+    """Whether the room's stated range stands for the air of these runs, because none of those that identify recorded it."""
+    return site.room_c is not None and not any(r.columns.air_c.size for r in runs if r.identifies)
 
 
 def _instruments(runs: list[Run]) -> set[str]:
@@ -238,11 +247,12 @@ async def make(  # noqa: PLR0913 - every one of them is a choice of the caller, 
     promise = Promise(proposal.tables, proposal.change, proposal.predicted, None, *_ends_s(gathered.records))
     candidate = candidate_of(site, promise, base, known.campaign.runs, form)
     context = await candidate_context(site, store, base, form, proposal.tables, clock)
-    status = base.status
+    status, stated = base.status, [STATED] if air_is_stated(site, known.campaign.runs) else []
     proposed = Proposed(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
         BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
-        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)), (*known.lines, *proposal.left_out),
+        by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)),
+        (*known.lines, *proposal.left_out, *stated),
         proposal.solved.holds_at,
     )  # fmt: skip
     plain = doc_of(proposed)

@@ -6,8 +6,10 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
+from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData
+from abbe.models.uncertainty.coverage import PROBABILITY, vector_factor
 from abbe.service.domain.run import Run
 from abbe.service.identification.artefact_answer import deviation_of_artefacts, touched_boxes_mm
 from abbe.service.rendering.document import PictureBlock, ReportFigure, Section, TextTable
@@ -78,29 +80,32 @@ ALONE = "the deviation of the machine: one pose shows machine and form of the ar
 def pose_readings(run: Run, data: RunData) -> Evaluated:
     """One pose as it was read, without the motion that fits it best: its features, their rms and their largest deviation.
 
-    ``data``: observations of ``run``. The uncertainty is that of repeated touches alone, as stated in the run.
+    ``data``: observations of ``run``. The uncertainty is that of the touches alone. U of the largest deviation and of the arrows is that of
+    the largest of so many vectors (Sidak): noise alone exceeds it in 5 % of all poses.
     """
-    assert data.points is not None
-    labels = list(dict.fromkeys(zip(data.points.feature, data.t_s.tolist(), strict=True)))
-    at = np.array([labels.index(k) for k in zip(data.points.feature, data.t_s.tolist(), strict=True)])
-    left = _without_motion(data)
-    deviation, nominal, u = np.zeros((len(labels), 3)), np.zeros((len(labels), 3)), np.zeros(len(labels))
-    deviation[at, data.points.component] = left
-    nominal[at] = data.points.nominal_mm
-    stated = dict(zip(run.columns.further["feature"].tolist(), run.columns.further["u_mm"].tolist(), strict=True))
-    u[:] = [stated[name] for name, _ in labels]
-    rms, u_rms = float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(u[at] ** 2) / left.size))
-    length = np.linalg.norm(deviation, axis=1)
-    worst = int(np.argmax(length))
+    p = data.points
+    assert p is not None
+    visits = list(zip(p.feature, data.t_s.tolist(), strict=True))
+    labels = list(dict.fromkeys(visits))
+    at = np.array([labels.index(k) for k in visits])
+    left, u = _without_motion(data), DEFAULT_SIGMA_MM["artefact"] / np.sqrt(data.weight_n)
+    deviation, nominal, largest_u = (np.zeros((len(labels), 3)) for _ in range(3))
+    deviation[at, p.component], largest_u[at, p.component], nominal[at] = left, u, p.nominal_mm
+    length, count = np.linalg.norm(deviation, axis=1), np.bincount(at)
+    factor = np.array([vector_factor(int(k), PROBABILITY ** (1.0 / len(labels))) for k in count])
+    expanded, worst = factor * largest_u.max(axis=1), int(np.argmax(length))
+    rms, u_rms, noise = float(np.sqrt(np.mean(left**2))), float(np.sqrt(np.mean(u**2) / left.size)), float(np.sqrt(np.mean(u**2)))
     group, method = "Features, without the motion that fits best", "as read"
     figures = [
         ReportFigure(group, "n", "features read", float(len(labels)), None, "", "count"),
         ReportFigure(group, "rms", "rms deviation of machine and artefact together", 1e3 * rms, 1e3 * u_rms, "µm", method),
+        ReportFigure(group, "u", "rms that the touches alone would give", 1e3 * noise, None, "µm", "as stated in the run"),
         ReportFigure(
-            group, "max", f"largest deviation, at {labels[worst][0]}", 1e3 * float(length[worst]), 1e3 * float(u[worst]), "µm", method
+            group, "max", f"largest deviation, at {labels[worst][0]}", 1e3 * float(length[worst]), 1e3 * float(expanded[worst]) / COVERAGE,
+            "µm", method,
         ),
-    ]
-    return Evaluated(figures=figures, pictures=_read_features(nominal, deviation, u), not_observable=[ALONE])
+    ]  # fmt: skip
+    return Evaluated(figures=figures, pictures=_read_features(nominal, deviation, expanded), not_observable=[ALONE])
 
 
 def _without_motion(data: RunData) -> F1:
@@ -112,17 +117,17 @@ def _without_motion(data: RunData) -> F1:
     return np.asarray(data.deviation_mm - motion @ np.linalg.lstsq(motion, data.deviation_mm, rcond=None)[0])
 
 
-def _read_features(nominal_mm: F2, deviation_mm: F2, u_mm: F1) -> list[PictureBlock]:
+def _read_features(nominal_mm: F2, deviation_mm: F2, expanded_mm: F1) -> list[PictureBlock]:
     """Arrows at the features, in the plane in which the artefact is widest; none for features on a line."""
     plane = max(PLANES, key=lambda p: np.prod([np.ptp(nominal_mm[:, k]) for k in PLANES[p][:2]]))
     across, up, _ = PLANES[plane]
     if min(np.ptp(nominal_mm[:, across]), np.ptp(nominal_mm[:, up])) <= 0.0:
         return []
-    length, expanded = np.linalg.norm(deviation_mm, axis=1), COVERAGE * u_mm
-    data = SlicePlane(plane, nominal_mm[None], 1e3 * deviation_mm[None], 1e3 * expanded[None], (length > expanded)[None])
+    length = np.linalg.norm(deviation_mm, axis=1)
+    data = SlicePlane(plane, nominal_mm[None], 1e3 * deviation_mm[None], 1e3 * expanded_mm[None], (length > expanded_mm)[None])
     magnified = magnification(float(np.ptp(nominal_mm, axis=0).max()), 1e3 * float(length.max()))
     texts = SliceTexts(
         "Deviation at the features, axes of the artefact", "", "", "not larger than U", f"errors magnified {magnified:g} times"
     )
-    caption = "Measured minus nominal, without the motion that fits best: machine and artefact together. U: repeated touches only."
+    caption = "Measured minus nominal, without the motion that fits best: machine and artefact together. U: touches only."
     return [PictureBlock(caption, [slice_plot(data, colour_top(1e3 * length), magnified, texts, key="features")])]

@@ -66,7 +66,7 @@ class VerificationFigures:
 def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> VerificationFigures:
     """Figures of a verification's runs: plain body diagonals and at most one helix.
 
-    ``room_c``: lowest and highest air temperature by the room's own record, which counts where no run recorded one.
+    ``room_c``: lowest and highest air temperature that a person states for the room, which counts where no run recorded one.
 
     Raises
     ------
@@ -134,7 +134,10 @@ def check_before(before: VerificationFigures) -> None:
     if not before.finite:
         what = "a figure is not a number"
     elif before.air_c is None:
-        what, remedy = "no air temperature was recorded", "measure with a laser's air sensor, or give room_temperature_c under [limits]"
+        what, remedy = (
+            "no air temperature was recorded",
+            "measure with a laser's air sensor, or give room_temperature_c under [calibration]",
+        )
     if what:
         raise TableRefused(f"the first verification is no basis for a comparison: {what}", f"{remedy}; nothing was written")
 

@@ -48,7 +48,6 @@ LIMITS = """[limits]
 table_value_um = 200
 table_change_um = 200
 table_beyond_percent = 100
-room_temperature_c = [20.5, 21.5]
 """
 QUICK = {"feed_mm_min": 6000.0, "touch_feed_mm_min": 200.0, "requalify_every": 100, "turned_every": 0}
 POSES = (((60.0, 60.0), 0.0), ((540.0, 70.0), 90.0), ((148.2, 180.0), 0.0), ((330.0, 200.0), 90.0))
@@ -116,7 +115,9 @@ def shop(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Shop]:
         text = sims.machine_file.read_text()
         assert text.count("\nlaser = ") == 2, "the device and its certificate"
         text = re.sub(r"\n(laser|ballbar) = .*", "", text)  # a shop with a probe only
-        sims.machine_file.write_text(text.replace("[calibration]", "[calibration]\nartefact = 2099-12-31"))
+        sims.machine_file.write_text(
+            text.replace("[calibration]", "[calibration]\nartefact = 2099-12-31\nroom = 2099-12-31\nroom_temperature_c = [20.5, 21.5]")
+        )
         plate = ArtefactObject.read(sims.ready["artefact"])
         (folder / "plate.toml").write_text(recipe("plate", POSES, plate))
         (folder / "check.toml").write_text(recipe("check", CHECK, plate))

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import hashlib
 import time
+from datetime import date
 from pathlib import Path
 
 import pytest
 
 from abbe.service.config import key_lines, load_machine
 from abbe.service.errors import ConfigError
+from abbe.service.site import site_of
 
 GOOD = """
 name = "VMC-1"
@@ -101,6 +103,16 @@ def test_machine_object_of_the_exchange_format(file: Path) -> None:
     }
 
 
+ROOM = "[calibration]\nroom = 2027-05-31\nroom_temperature_c = "
+LASER = 'laser = "modbus+rtu:///dev/ttyS0?baud=115200"\nfixture = "fixture+console:"\n'
+
+
+def test_the_air_of_a_shop_without_a_laser_is_stated_within_1_k(file: Path) -> None:
+    file.write_text(GOOD.replace(LASER, f"{ROOM}[15.1, 16.1]\n").replace("[limits]", "[limits]\ntemperature_c = [15, 25]"))
+    site = site_of(load_machine(file).machine)
+    assert (site.room_c, site.calibrated_until) == ((15.1, 16.1), {"room": date(2027, 5, 31)})
+
+
 BAD = [
     ('name = "VMC-1"', "", "key 'name' is missing"),
     ('name = "VMC-1"', "name = 5", "name: expected a string, got 5"),
@@ -161,6 +173,10 @@ BAD = [
     ("[[schedule]]", '[[staffed]]\nname="m"\ndays=["fri"]\nstart=25\nend=06:00:00\n[[schedule]]', r"staffed\[1\].start: expected"),
     ("[[schedule]]", '[[schedule]]\nname="nightly"\ncron="0 3 * * *"\n[[schedule]]', "two schedules are named 'nightly'"),
     ('name = "VMC-1"', "name = ", "not valid TOML: .*line 2"),
+    ("[limits]", "[calibration]\nroom_temperature_c = [20, 21]\n[limits]", "room and room_temperature_c belong together, expected both"),
+    ("[limits]", f"{ROOM}[20, 21.2]\n[limits]", "room_temperature_c is 20 to 21.2, expected at most 1 K"),
+    ("[limits]", f"{ROOM}[20, 21]\n[limits]", "room_temperature_c is stated beside a laser, expected one of both"),
+    (LASER, f"{ROOM}[16.5, 17.5]\n", r"room_temperature_c is outside of \[limits\] temperature_c, expected inside 18 to 24"),
 ]
 
 

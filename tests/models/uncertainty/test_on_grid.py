@@ -35,7 +35,8 @@ def assert_same(sources, points, **how):
     assert np.abs(on.deviation_mm[order] - by.deviation_mm).max() < 1e-12
     assert np.abs(on.covariance_mm2[order] - by.covariance_mm2).max() < 1e-10 * scale
     assert np.abs(on.variance_mm2[:, order] - by.variance_mm2).max() < 1e-10 * scale
-    assert on.expanded_mm[order] == pytest.approx(by.expanded_mm, rel=1e-8)
+    assert on.expanded_mm[order] == pytest.approx(by.expanded_mm, rel=1e-8, abs=1e-12)
+    assert on.variance_mm2.min() >= 0.0
 
 
 @pytest.mark.parametrize("framed", [False, True])
@@ -44,6 +45,14 @@ def test_a_grid_is_predicted_as_its_points_are(sources, framed, tool_mm):
     machine = sources.solution.machine
     frame = volume_frame(machine) if framed else None
     assert_same(sources, grid(machine.stroke_mm, (7, 12, 9)), tool_mm=tool_mm, frame=frame)
+
+
+def test_no_source_gives_a_negative_variance_where_the_frame_cancels_it(sources):
+    """At the datum corner and in the middle of the volume some sources vanish but for rounding."""
+    machine = sources.solution.machine
+    lines = [np.linspace(lo, hi, 9) for lo, hi in machine.stroke_mm]
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 3)
+    assert_same(sources, points, frame=volume_frame(machine))
 
 
 def test_long_lines_are_worked_off_in_strips_by_two_threads(sources, monkeypatch):

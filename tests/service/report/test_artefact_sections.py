@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.compensation.proposals import change_of
 from abbe.service.identification.artefact_answer import touched_boxes_mm
@@ -58,7 +59,7 @@ def test_tables_of_two_heights_take_out_what_both_have(solved: Solved) -> None:
 def test_one_pose_shows_machine_and_artefact_together_without_the_best_motion(tmp_path: Path) -> None:
     run = from_folder(campaign(tmp_path)).runs[1]
     found = pose_readings(run, run_data(run))
-    count, rms, most = found.figures
+    count, rms, noise, most = found.figures
     x, y = (run.columns.further[f"deviation_{a}_mm"] for a in "xy")
     place = np.array([run_data(run).points.nominal_mm[k, :2] for k in range(25)])  # type: ignore[union-attr]
     own = (x - x.mean()) + 1j * (y - y.mean())
@@ -69,7 +70,7 @@ def test_one_pose_shows_machine_and_artefact_together_without_the_best_motion(tm
     assert most.value == pytest.approx(1e3 * np.abs(own).max(), rel=1e-6)
     assert rms.u is not None
     assert most.u is not None
-    assert 0.0 < rms.u < most.u
+    assert 0.0 < rms.u < noise.value < most.u < most.value
     assert "machine and form of the artefact together" in found.not_observable[0]
     (picture,) = found.pictures
     assert picture.svgs[0].count("<title>(") == 25
@@ -80,4 +81,16 @@ def test_features_on_a_line_have_figures_and_no_picture(tmp_path: Path) -> None:
     data = run_data(run)
     assert data.points is not None
     flat = replace(data, points=replace(data.points, nominal_mm=data.points.nominal_mm * [1.0, 0.0, 0.0]))
-    assert [pose_readings(run, flat).pictures, len(pose_readings(run, flat).figures)] == [[], 3]
+    assert [pose_readings(run, flat).pictures, len(pose_readings(run, flat).figures)] == [[], 4]
+
+
+def test_noise_alone_exceeds_u_of_the_largest_deviation_in_a_twentieth_of_all_poses(tmp_path: Path) -> None:
+    run = from_folder(campaign(tmp_path)).runs[0]
+    data, rng, beyond = run_data(run), np.random.default_rng(7), 0
+    u = DEFAULT_SIGMA_MM["artefact"] / np.sqrt(data.weight_n)
+    for _ in range(300):
+        most = pose_readings(run, replace(data, deviation_mm=rng.normal(0.0, u))).figures[-1]
+        assert most.value is not None
+        assert most.u is not None
+        beyond += most.value > 2.0 * most.u
+    assert 2 <= beyond <= 28, "15 of 300 are expected; the fitted motion takes some noise away"
