@@ -63,6 +63,33 @@ def test_a_silent_screen_comes_back_as_itself_and_ages_stand_still(chromium: Bro
         assert (page.inner_text("#age"), "/" in asked, page.url) == (OLD, False, f"{base}/schedule")
 
 
+def test_the_way_to_log_in_comes_back_after_a_lost_request_and_only_screens_that_stop_stay(chromium: Browser) -> None:
+    base, lost = f"http://127.0.0.1:{free_port()}", list[bool]()
+
+    def out(route: Route) -> None:
+        if lost:
+            route.abort()
+        else:
+            route.fulfill(status=401, json={})
+
+    with browser(chromium) as seen:
+        page = seen.page
+        page.clock.install()
+        answered(page, base, [screen("<h1>Some screen</h1>")], [])
+        page.route(f"{base}/api/v1/status", out)
+        page.goto(f"{base}/live")
+        page.wait_for_selector("html[data-ready=yes]")
+        for gone in (False, True, False):
+            lost[:] = [gone] * gone
+            page.clock.run_for(2500)
+            page.wait_for_selector("#lost:not(:has(a))" if gone else "#lost a[href='/login']")
+        assert page.url == f"{base}/live"
+        page.goto(f"{base}/audit")
+        page.wait_for_selector("html[data-ready=yes]")
+        page.clock.run_for(2500)
+        page.wait_for_url("**/login")
+
+
 def test_a_refused_live_connection_is_told(chromium: Browser) -> None:
     base = f"http://127.0.0.1:{free_port()}"
     with browser(chromium) as seen:

@@ -105,12 +105,14 @@ function connected(yes, silent = false) {
   document.body.classList.toggle("stale", !yes);
 }
 
-// The log-in has run out: the screen is grey until somebody logs in, and its Stop still works.
+// The log-in has run out: home and the running measurement stay in grey until somebody logs in, and their Stop still works. Every other
+// screen is left, so that nobody reads it at an unattended panel.
+const stays = Boolean(kept) || ["/", "/live"].includes(location.pathname);
 let out = false;
 
 function loggedOut() {
-  if (out) return;
   out = true;
+  if (banner.querySelector("a")) return;  // a banner that is built again is read aloud again
   connected(false);
   const link = document.createElement("a");
   link.href = "/login";
@@ -125,7 +127,7 @@ async function refresh() {
     touched = false;
     const answer = await ask("/api/v1/status", active);
     if (answer.status === 401) {
-      if ((await ask("/api/v1/stop", false)).ok) loggedOut();
+      if (stays && (await ask("/api/v1/stop", false)).ok) loggedOut();
       else location.assign("/login");
       setTimeout(refresh, PERIOD_MS);
       return;
