@@ -16,7 +16,8 @@ SHORTEST_S = 0.2
 OLD_S = 5.0
 """An answer that is older, s, is not shown."""
 MOST_PERCENT = 1000.0
-"""Largest override that is believed, %."""
+"""Largest override that is believed, %. An assumption: no standard names a largest one, and ten times the programmed feed is far above what
+an operator's switch reaches. More is a number that was misread."""
 MM_PER_COUNT = 1e-7
 MM_MIN_PER_MM_US = 6e7
 
