@@ -148,7 +148,7 @@ class Combination:
     """A direction of parameter space that leaves no trace in the observations.
 
     ``weights``: name and component of each parameter, in units of its typical size, largest first. Small components are included, because
-    without them the direction would leave a trace. ``text``: a sentence about the members above `LEAST_SHARE`.
+    without them the direction would leave a trace. ``text``: a sentence about the ``members``.
     """
 
     weights: tuple[tuple[str, float], ...]
@@ -156,7 +156,7 @@ class Combination:
 
     @property
     def members(self) -> tuple[str, ...]:
-        """Names of the relevant members, largest first."""
+        """Names of the parameters with a share above `LEAST_SHARE`, largest first."""
         return _members(self.weights)
 
 

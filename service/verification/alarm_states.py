@@ -71,7 +71,10 @@ class AlarmHead:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Alarm(AlarmHead):
-    """An alarm after all its lines. ``first``: signals of the check that raised it; ``judged_seq``: line of the last check."""
+    """Present state of an alarm: the result of all entries in its history.
+
+    ``first``: signals of the check that raised it; ``last_seq``, ``judged_seq``: numbers of the last entry and of that of the last check.
+    """
 
     number: int
     first: tuple[Signal, ...]

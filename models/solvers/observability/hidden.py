@@ -262,7 +262,7 @@ class HiddenGroup:
 
 @dataclass(frozen=True)
 class Advice:
-    """The best next addition, and the ``rank`` after it, out of ``of`` coefficients."""
+    """The best measurement to add. With it, the runs would determine ``rank`` of the ``of`` coefficients."""
 
     cure: str
     rank: int

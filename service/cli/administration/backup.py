@@ -77,7 +77,7 @@ def restore(
 
 
 def _source(db: str | None, machine: Path | None) -> BackupSource:
-    """Return the database that the options name; of a machine file, with its folder of samples."""
+    """Return what to back up: the database given by ``db`` or by the machine file, which also gives the folder of samples."""
     from abbe.service.backup.backup import BackupSource
     from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine
