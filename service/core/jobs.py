@@ -170,6 +170,7 @@ class JobRegistry:
                 state=State.READY,
                 text="",
                 begun_utc=self._clock.utc(),
+                alarm=job.alarm,
             ),
         )
         self._jobs[number] = entry

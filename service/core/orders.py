@@ -193,7 +193,9 @@ def full_campaigns(
 
         target = f"{context.machine}, {recipe}" + (f", alarm {alarm}" if alarm else "")
         begun = AuditEvent(who=who, action=CAMPAIGN, target=target, outcome="begun", doc={})
-        return _OrderJob(CAMPAIGN, recipe, _AuditTrail(context.audit, begun), act)
+        job = _OrderJob(CAMPAIGN, recipe, _AuditTrail(context.audit, begun), act)
+        job.alarm = alarm or None
+        return job
 
     return FullCampaigns(names, of, may, no_alarms if alarms is None else alarms.against)
 

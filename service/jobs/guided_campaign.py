@@ -108,7 +108,8 @@ async def _measured(context: InvestigationContext, source: RecipeSource, begins:
             except BaseException as error:
                 kept = f"completed runs of campaign {name!r} are kept"
                 resume = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
-                error.add_note(f"{kept}; the search can be started again" if begins is not None else f"{kept}: {resume}")
+                anew = "" if begins is None else "; a search that is started again begins with the first set-up"
+                error.add_note(f"{kept}{anew}; {resume}")
                 raise
 
 

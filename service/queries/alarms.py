@@ -19,7 +19,7 @@ from abbe.service.queries.status import AlarmSummary, summaries
 from abbe.service.queries.tables import ProposalSummary, proposals, tables
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import PushSummary
-from abbe.service.verification.alarm_states import Alarm, folded
+from abbe.service.verification.alarm_states import Alarm, folded, step_of_order
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -83,10 +83,11 @@ class PathStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmPath:
-    """The steps of one alarm, from its check to the report."""
+    """The steps of one alarm, from its check to the report. ``begins``: what a search that is ordered now does first."""
 
     alarm: int
     steps: Sequence[PathStep]
+    begins: AlarmKind
 
     @property
     def now(self) -> PathStep | None:
@@ -128,7 +129,7 @@ class _AlarmHistory:
             PathStep(key=key, state="now" if k == first and not late else state, number=number, recipe=recipe)
             for k, (key, state, number, recipe) in enumerate(found)
         ]
-        return AlarmPath(alarm=alarm.number, steps=steps)
+        return AlarmPath(alarm=alarm.number, steps=steps, begins=step_of_order(alarm))
 
     def _steps(self, alarm: Alarm) -> Iterator[tuple[Step, StepState, int | None, str]]:
         proposal, search = self._proposal(alarm), self._search(alarm)

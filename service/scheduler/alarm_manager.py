@@ -292,6 +292,7 @@ class _Investigation(_AlarmJob):
 
     def __init__(self, manager: AlarmManager, alarm: Alarm, terms: Schedule, look: Investigate) -> None:
         super().__init__(manager, terms)
+        self.alarm = alarm.number
         self._alarm, self._look, self._last = alarm, look, JobOutcome("nothing", "")
 
     async def work(self, progress: ProgressSink, control: Control) -> JobOutcome:
@@ -330,6 +331,7 @@ class _ApprovedPush(_AlarmJob):
 
     def __init__(self, manager: AlarmManager, found: ApprovedProposal, terms: Schedule) -> None:
         super().__init__(manager, terms)
+        self.alarm = found.alarm or None  # a push without an alarm is recorded under `NO_ALARM`
         self._found, self._after, self._is_begun = found, 0, False
 
     async def begin(self) -> None:

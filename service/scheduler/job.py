@@ -37,10 +37,11 @@ SHUTDOWN_RECORD_S = 1.0
 class Job(ABC, Generic[T]):
     """Work that has the machine to itself, and its records.
 
-    ``T``: what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``: as in `JobState`.
+    ``T``: what the work returns. ``terms``: its name and recipe, as watchers and people see them. ``kind``, ``alarm``: as in `JobState`.
     """
 
     kind: JobKind = "check"
+    alarm: int | None = None
     terms: Schedule
     handles_abort: ClassVar[bool] = False
     """Whether the work ends by itself when aborted; otherwise it is cancelled."""

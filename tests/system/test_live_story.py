@@ -1,5 +1,8 @@
-"""From a drift of the machine to the signed report, by touches only, and nothing is pretended: `abbe serve` measures, searches, pushes and
+"""From a drift of the machine to the signed report, by touches and passwords that are typed: `abbe serve` measures, searches, pushes and
 proves on a simulated machine over its wires. A metrologist checks and searches; an approver signs and pushes. Each has a log-in.
+
+Prepared, not walked: the control is pretended to be commissioned, and proved for pushes with nobody there; the baseline and the users are
+stored by functions. From the first check on, nothing is pretended.
 
 `test_story.py` walks the same screens in every size, light and language with a store that is filled by hand.
 """
@@ -53,6 +56,7 @@ CHECK_MS, CAMPAIGN_MS, PUSH_MS = 300_000, 900_000, 600_000
 
 
 async def _prepare(url: str, sims: Sims) -> None:
+    """Pretend that the control is commissioned and proved; store a measured baseline and two users."""
     with Store.open(url) as store:
         site = site_of(load_machine(sims.machine_file).machine)
         async with open_session(site.urls) as session:
@@ -160,7 +164,13 @@ def to_the_alarm(finger: Finger) -> None:
 
 @pytest.mark.skipif(not LONG, reason="five minutes on a simulated machine: ABBE_TEST_LONG=1 walks the whole way")
 @pytest.mark.parametrize(("size", "lang"), [("1280", "en"), ("390", "ja")])
-def test_from_a_drift_to_the_signed_report_nothing_is_pretended(chromium: Browser, shop: Shop, axe: str, size: str, lang: str) -> None:  # noqa: F811
+def test_on_a_prepared_machine_a_drift_is_followed_to_the_signed_report(
+    chromium: Browser,
+    shop: Shop,
+    axe: str,  # noqa: F811 - the fixture
+    size: str,
+    lang: str,
+) -> None:
     options: Any = {"viewport": SIZES[size], "locale": lang, "has_touch": True}
     with closing(chromium.new_context(**options)) as context:
         page = context.new_page()

@@ -14,6 +14,7 @@ from pydantic import AfterValidator
 
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import Rules
+from abbe.service.queries.alarms import path_of_alarm
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
@@ -42,6 +43,8 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
         choices = plans.choices()
         chosen = recipe if recipe in choices else next(iter(choices), "")
         dry = await asyncio.to_thread(plans.run, chosen, rate_hz, current().drawn("mm"))
+        alarm = (alarm or 0) if chosen == CAMPAIGN else 0
+        way = await context.read(path_of_alarm, context.reader, alarm) if alarm else None
         return await context.show(
             "new.html",
             status=status,
@@ -51,7 +54,8 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
             rate_hz=rate_hz,
             dry=dry,
             guided=chosen == CAMPAIGN,
-            alarm=(alarm or 0) if chosen == CAMPAIGN else 0,
+            alarm=alarm,
+            begins=None if way is None else way.begins,
             max_feed=None if plans.machine is None else plans.machine.max_feed_mm_min,
             may_measure=current().may(Permission.MEASURE) and bool(current().csrf),
             may_propose=current().may(Permission.PROPOSE),

@@ -103,13 +103,13 @@ async function showEnd() {
   const ended = answer?.ok ? await answer.json() : null;
   setText("live-outcome", words["live.ended"].replace("{state}", ended ? words[`slot.${ended.state}`] ?? ended.state : "–"));
   setText("live-text", ended?.text ?? "");
-  if (ended?.verification) {
-    find("live-check").hidden = false;
-    find("live-check").querySelector("a").href = `/check?id=${ended.verification}`;
-  }
-  if (ended?.proposal) {
-    find("live-made").hidden = false;
-    find("live-made").querySelector("a").href = `/proposal?id=${ended.proposal}`;
+  for (const [id, screen, number] of [
+    ["live-check", "check", ended?.verification],
+    ["live-made", "proposal", ended?.proposal],
+    ["live-alarm", "alarm", ended?.alarm],
+  ]) {
+    find(id).hidden = !number;
+    find(id).querySelector("a").href = `/${screen}?id=${number}`;
   }
   setText("live-state", words["measuring.ended"]);
   find("live-over").hidden = false;

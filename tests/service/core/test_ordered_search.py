@@ -60,6 +60,7 @@ async def test_a_person_starts_the_search_for_the_cause_and_its_lines_name_her(b
         assert (await Searching(bench, finds).ordered(tasks, 1)).outcome == "done"
         (job,) = await bench.until(lambda: bench.jobs("done"))
     assert (job.state, job.text, job.proposal, job.who) == ("done: proposed", "proposal 4 waits", 4, "user:bob")
+    assert job.alarm == 1, "its screen leads to its own alarm"
     ordered = bench.alarm().last(AlarmKind.ORDERED)
     assert ordered is not None
     assert ordered.facts.name == "bob"

@@ -198,6 +198,37 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         assert isinstance(asking.exception(), Stopped) == (number == 2)
 
 
+@pytest.mark.parametrize("searching", [False, True])
+async def test_what_is_broken_off_tells_how_it_is_gone_on_with_and_that_a_new_search_is_not(
+    searching: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    @asynccontextmanager
+    async def session(*_: object, **__: object) -> AsyncIterator[Any]:
+        yield SimpleNamespace(controller=None)
+
+    async def stopped(*_: object, **__: object) -> Any:
+        raise Stopped("by a person", "")
+
+    for name, instead in (
+        ("lock_machine", lambda _: nullcontext()),
+        ("recovered_session", session),
+        ("paced", lambda plan, _: plan),
+        ("check_devices", all_there),
+        ("_check_table_acts", all_there),
+        ("start_campaign", all_there),
+        ("measure", stopped),
+    ):
+        monkeypatch.setattr(work, name, instead)
+    bench = pretended(max_feed_mm_min=6000.0, urls=SimpleNamespace(cnc="cnc"))
+    bench.live = None
+    bench.control.now(State.RUNNING)
+    with pytest.raises(Stopped) as told:
+        await work._measured(bench, {}, all_there if searching else None)  # type: ignore[arg-type]
+    (note,) = told.value.__notes__
+    assert "abbe measure -m MACHINE.toml --resume 'full 1'" in note
+    assert ("begins with the first set-up" in note) == searching
+
+
 class Lines:
     """An alarm and its lines, without a store."""
 

@@ -42,6 +42,24 @@ def to_do(reader: Reader, number: int) -> str:
     return "" if way.now is None else step_address(way.now, to_do_for=way.alarm)
 
 
+def begins(reader: Reader, number: int) -> str:
+    """What a search for the cause does first, were it ordered now."""
+    way = path_of_alarm(reader, number)
+    assert way is not None
+    return way.begins
+
+
+def test_a_search_begins_after_the_lines_of_its_alarm(reader: Reader, filled: Filled) -> None:
+    store = reader.store
+    first = next(e for e in store.alarms.entries(filled.machine) if e.kind == "raised")
+    number = store.alarms.append(filled.machine, None, 0, AlarmKind.RAISED, first.facts).alarm
+    seen = [begins(reader, number)]
+    for seq, kind in enumerate((AlarmKind.MEASURED, AlarmKind.FAILED, AlarmKind.FAILED, AlarmKind.DISCOVERED, AlarmKind.ENDED), start=1):
+        store.alarms.append(filled.machine, number, seq, kind, AlarmFacts(campaign="c"))
+        seen.append(begins(reader, number))
+    assert seen == ["measured", "discovered", "discovered", "discovered", "proposed", "measured"]
+
+
 async def test_from_the_alarm_to_the_report(reader: Reader, filled: Filled) -> None:
     store, proposal = reader.store, filled.proposals[2]
     assert to_do(reader, 2) == "/alarm?id=2"
@@ -83,5 +101,6 @@ def test_without_a_proposal_the_cause_is_to_be_measured_or_nothing_is_needed(rea
         "a proposal of before is none of this search"
     )
     assert to_do(reader, number) == f"/new?recipe=identification&alarm={number}"
+    assert begins(reader, number) == "measured"
     store.alarms.append(filled.machine, number, 4, AlarmKind.CLEARED, AlarmFacts(verification=20, text="pass"))
     assert states(reader, number) | {"approval": "skipped", "push": "skipped", "proof": "done"} == states(reader, number)

@@ -16,9 +16,11 @@ import pytest
 from abbe.service.channel.messages import Answer, ConfirmPrompt, Jobs, Outcome, Snapshot, StartJob, Wire, from_web
 from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.users.roles import ALLOWED, Permission, Role
+from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
@@ -80,7 +82,7 @@ async def desk(plant: Plant) -> AsyncIterator[Desk]:
     view = StatusReader(Reader(plant.store, NAME, plant.clock), "0.1.0", core, core.next_due, "")
     names = ("quick-check", CAMPAIGN)
     parts = Parts(core, plant.store, NAME, names, Rehearsals(TOLD, names), (CAMPAIGN,))
-    app = create_app(view, version="0.1.0", auth=plant.auth, parts=parts)
+    app = create_app(view, version="0.1.0", auth=plant.auth, parts=parts, api=Sources(reader=view.reader))
     async with httpx.AsyncClient(transport=httpx.ASGITransport(app, False), base_url=BASE, headers={"Origin": BASE}) as client:
         made = Desk(client, far, core)
         tasks = [asyncio.create_task(core.listen()), asyncio.create_task(made.serve())]
@@ -176,6 +178,34 @@ async def test_the_cause_of_an_alarm_is_searched_from_the_same_checklist(desk: D
     assert sent.status_code == 202
     assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=CAMPAIGN, key="", who="user:a-metrologist", alarm=3)
     assert plant.store.audit.events(1)[0].target == f"job {NUMBER}, recipe {CAMPAIGN}, alarm 3"
+
+
+async def test_before_the_start_the_screen_says_what_comes_first_and_asks_for_no_set_up_where_nothing_is_mounted(
+    desk: Desk, plant: Plant
+) -> None:
+    who = plant.session("metrologist")
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    facts = AlarmFacts(recipe="quick-check", schedule="yearly", verification=1, text="too far off", campaign="c")
+    number, shown = 0, dict[str, tuple[int, int]]()
+    for seq, kind in enumerate((AlarmKind.RAISED, AlarmKind.MEASURED, AlarmKind.DISCOVERED)):
+        number = plant.store.alarms.append(NAME, number or None, seq, kind, facts).alarm
+        page = await desk.page(f"/new?recipe={CAMPAIGN}&alarm={number}", who)
+        words = ("from the first set-up", "searches in these runs", "computes the proposal")
+        (said,) = (word for word in words if word in page)
+        assert 'id="start"' in page
+        shown[said] = page.count('type="checkbox"'), len(re.findall(r"<li>(Bar|Laser)", page))
+    assert shown == {"from the first set-up": (4, 19), "searches in these runs": (0, 0), "computes the proposal": (0, 0)}
+
+
+@pytest.mark.parametrize(("found", "label"), [(False, "Search for the cause"), (True, "Compute a proposal")])
+async def test_the_button_says_what_the_search_begins_with(desk: Desk, plant: Plant, found: bool, label: str) -> None:
+    facts = AlarmFacts(recipe="quick-check", schedule="yearly", verification=1, text="too far off", campaign="c", name="petra")
+    number = plant.store.alarms.append(NAME, None, 0, AlarmKind.RAISED, facts).alarm
+    kinds = (AlarmKind.ACKNOWLEDGED, *((AlarmKind.MEASURED, AlarmKind.DISCOVERED) if found else ()))
+    for seq, kind in enumerate(kinds, start=1):
+        plant.store.alarms.append(NAME, number, seq, kind, facts)
+    page = await desk.page(f"/alarm?id={number}", plant.session("metrologist"))
+    assert re.findall(r'<a class="go main" href="/new[^>]*>([^<]*)<', page) == [label]
 
 
 async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) -> None:

@@ -201,6 +201,7 @@ def test_a_dry_run() -> None:
         "may_measure": True,
         "guided": False,
         "alarm": 0,
+        "begins": None,
         "key": "k",
         "expired": [],
         "temperature_c": None,

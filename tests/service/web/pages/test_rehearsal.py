@@ -84,7 +84,16 @@ def test_a_rate_is_part_of_the_name() -> None:
 def test_the_screen_counts_the_set_ups() -> None:
     told = SimpleNamespace(job=None, next_due=[])
     known = {"bar": strip_of(None), "choices": PLANS.choices(), "chosen": "quick-check", "rates_hz": PLANS.rates_hz, "rate_hz": 100}
-    known |= {"max_feed": 6000.0, "may_measure": True, "guided": False, "alarm": 0, "key": "k", "expired": [], "temperature_c": None}
+    known |= {
+        "max_feed": 6000.0,
+        "may_measure": True,
+        "guided": False,
+        "alarm": 0,
+        "begins": None,
+        "key": "k",
+        "expired": [],
+        "temperature_c": None,
+    }
     screen = environment().get_template("new.html")
     assert "<dd>5</dd>" in screen.render(machine="m", zone="UTC", status=told, dry=PLANS.run("quick-check", 100), **known)
     for name in ("new", "runs", "volume"):  # the filter `length` is ours here, and converts a number
