@@ -211,6 +211,7 @@ def test_a_browser_draws_a_running_check_and_stops_it(tmp_path: Path) -> None:
         stop_elsewhere(page, one)
         page.wait_for_selector("#live-over:not([hidden])", timeout=30_000)
         assert "cannot tell" in page.inner_text("#live-outcome")
+        assert page.locator("#live-alarm").is_hidden(), "this check was for no alarm"
         assert states(one)[-1] in {"stopped", "aborted"}
         assert seen.errors == []
         assert only_us(seen)

@@ -227,10 +227,11 @@ async def test_who_may_not_propose_starts_checks_only(desk: Desk, plant: Plant) 
     assert (await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN}, headers=plant.token("metrologist"))).status_code == 202
 
 
-async def test_how_it_ended_is_told_with_its_proposal(desk: Desk, plant: Plant) -> None:
-    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+async def test_how_it_ended_is_told_with_its_proposal_and_its_own_alarm(desk: Desk, plant: Plant) -> None:
+    await desk.says(replace(ENDED, alarm=5), replace(MOMENT, check=None, changes=7))
     told = (await desk.client.get(f"/api/v1/jobs/{NUMBER}", headers=plant.token("viewer"))).json()
-    assert (told["state"], told["solution"], told["proposal"], told["prompt"]) == ("done: proposed", 7, 1, 0)
+    assert (told["state"], told["solution"], told["proposal"], told["alarm"], told["prompt"]) == ("done: proposed", 7, 1, 5, 0)
     shown = await desk.page("/live", plant.session("viewer"))
     assert "proposal 1 waits" in shown
     assert 'href="/proposal?id=1"' in shown
+    assert 'href="/alarm?id=5"' in shown
