@@ -51,7 +51,7 @@ def status_of_proposal(
     if rejections:
         return ProposalStatus("rejected", f"by {rejections[-1].name}: {rejections[-1].reason}")
     if proposed.reasons:
-        return ProposalStatus("refused", f"{len(proposed.reasons)} reasons against it when it was proposed")
+        return ProposalStatus("refused", f"reasons against it when it was proposed: {len(proposed.reasons)}")
     wrote = [e.push for e in journal.entries if e.state is PushState.STAGING and e.utc > proposed.utc]
     if wrote:
         return ProposalStatus("superseded", f"push {wrote[-1]} has written into the controller since the proposal")
@@ -59,7 +59,7 @@ def status_of_proposal(
         return ProposalStatus("expired", f"its measurement is older than {proposed.limits.age_h:g} h")
     approval, why = valid_approval(proposed, approvals, now_s, two_people=proposed.two_people)
     if approval is not None:
-        return ProposalStatus("approved", f"by {approval.name} until {approval.expiry}")
+        return ProposalStatus("approved", f"by {approval.name} until {_minute(approval.expiry)}")
     return ProposalStatus("proposed", why if approvals or proposed.two_people else "waits for a push")
 
 
@@ -88,14 +88,14 @@ def valid_approval(
     proposed: Proposed, approvals: Sequence[ProposalApproval], now_s: float, *, two_people: bool
 ) -> tuple[ProposalApproval | None, str]:
     """Return the last valid approval and an empty text; otherwise None and the reason."""
-    why = "not approved yet: run abbe comp approve"
+    why = "not approved yet"
     for row in reversed(approvals):
         if two_people and same_person(row.name, proposed.by):
             why = f"{row.name} proposed it and cannot approve it"
         elif row.digest != proposed.binding(row.expiry):
             why = f"{row.name} approved another table, base, machine or limits"
         elif now_s >= _utc_s(row.expiry):
-            why = f"the approval of {row.name} expired at {row.expiry}"
+            why = f"the approval of {row.name} expired at {_minute(row.expiry)}"
         else:
             return row, ""
     return None, why
@@ -104,6 +104,11 @@ def valid_approval(
 def same_person(one: str, other: str) -> bool:
     """Whether two names belong to the same person: letter case and outer blanks do not count."""
     return one.strip().casefold() == other.strip().casefold()
+
+
+def _minute(utc: str) -> str:
+    """A stored time for people, to the minute."""
+    return f"{utc[:10]} {utc[11:16]} UTC"
 
 
 def _utc_s(text: str) -> float:

@@ -141,7 +141,7 @@ class _AlarmHistory:
         searched = search is not None and search.state in SEARCHED
         yield (
             "cause",
-            "done" if searched or proposal is not None else "failed" if failed else later,
+            "done" if searched else "skipped" if proposal is not None else "failed" if failed else later,
             None if search is None else search.number,
             "",
         )

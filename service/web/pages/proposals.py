@@ -87,7 +87,7 @@ def _row(cells: Sequence[str]) -> list[str]:
 
 
 def _facts(found: ProposalDetail) -> list[tuple[str, str]]:
-    return [
+    facts = [
         ("proposal.machine", found.machine),
         ("proposal.campaign", found.campaign),
         ("proposal.solution", str(found.solution)),
@@ -97,6 +97,7 @@ def _facts(found: ProposalDetail) -> list[tuple[str, str]]:
         ("proposal.holds_at", found.holds_at),
         ("proposal.digest", found.digest),
     ]
+    return [(key, value) for key, value in facts if value]
 
 
 PUSH_SIGNS = {"kept": "ok", "rolled back": "bad", "refused": "bad", "failed": "bad", "open": "bad"}

@@ -92,9 +92,9 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
     for one in known:
         if any(signal.figure == key for signal in one.signals):
             text = f"{frame.translate('alarm')} {one.alarm}"
-            marks.append((one.raised_utc, "alarm", "▲", f"{text} {frame.state('alarm.state', 'raised')}"))
+            marks.append((one.raised_utc, "alarm", "▲", f"{text} {frame.state('alarm.kind', 'raised')}"))
             if one.cleared_utc is not None:
-                marks.append((one.cleared_utc, "over", "▽", f"{text} {frame.state('alarm.state', 'cleared')}"))
+                marks.append((one.cleared_utc, "over", "▽", f"{text} {frame.state('alarm.kind', 'cleared')}"))
     return marks
 
 

@@ -189,7 +189,7 @@ class Curve extends Box {
     const edge = { stroke: "transparent", points: { show: false } };
     this.main = new Plot(host, {
       scales: { x: { time: false, range: (_, min, max) => [min, max] }, y: { range: [Math.min(0, ...low) * 1.06 || -0.05 * most, Math.max(0, ...high) * 1.06 || 0.05 * most] } },
-      padding: [12, 12, 0, 0],
+      padding: [12, 20, 0, 0],
       axes: axes(null, colours, `${told.name} [${told.unit}]`, told.x_name),
       series: [{}, { stroke: colours.accent, width: 2, dash: told.dashed ? [6, 4] : [], points: { show: false } }, edge, edge],
       bands: [{ series: [3, 2], fill: `${colours.accent}33` }],
@@ -230,7 +230,7 @@ class Readings extends Box {
     this.begun = false;
     this.main = new Plot(host, {
       scales: { x: { time: false, range: (_, min, max) => [min, max] }, y: { range: (_, min, max) => uPlot.rangeNum(min, max, 0.08, true) } },
-      padding: [12, 12, 0, 0],
+      padding: [12, 20, 0, 0],
       axes: axes(null, colours, told.y_name, told.x_name),
       series: [{}, line, line],
       bands: [{ series: [2, 1], fill: `${colours.accent}55` }],
@@ -309,7 +309,7 @@ class Trend extends Box {
     below.replaceChildren();
     const padded = (list) => [null, ...list, null];
     this.main = new Plot(main, {
-      scales, tzDate: date, padding: [12, 12, 0, 0],
+      scales, tzDate: date, padding: [12, 20, 0, 0],
       axes: axes(days, colours, `${told.name} [${told.unit}]`),
       series: [{}, { paths: () => null, points: { show: false } }],
       hooks: { drawAxes: [(u) => this.behind(u, colours)], draw: [(u) => this.points(u, colours)], setScale: [(u, key) => key === "x" && this.follow(u)] },
@@ -319,7 +319,7 @@ class Trend extends Box {
     const curve = (stroke, dash) => ({ stroke, dash, width: 1, spanGaps: true, points: { show: false } });
     this.chart = new Plot(below, {
       scales: { x: scales.x, y: { range: (_, min, max) => [Math.min(-1.15, min ?? 0), Math.max(1.15, max ?? 0)] } },
-      tzDate: date, padding: [6, 12, 0, 0],
+      tzDate: date, padding: [6, 20, 0, 0],
       axes: axes(days, colours, words["plot.share"]),
       series: [{}, curve(colours.accent), curve(colours.accent, [2, 3]), curve(colours.unclear)],
       hooks: { draw: [(u) => inside(u, (pen, x, y, b) => {

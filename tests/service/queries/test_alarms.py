@@ -95,7 +95,7 @@ def test_without_a_proposal_the_cause_is_to_be_measured_or_nothing_is_needed(rea
     assert to_do(reader, number) == ""
     proposal = store.proposals.get(filled.proposals[2])
     store.proposals.add(proposal.machine, proposal.solution_id, proposal.doc, proposal.digest)
-    assert states(reader, number)["cause"] == "done", "somebody has proposed since"
+    assert states(reader, number)["cause"] == "skipped", "somebody has proposed since: nobody searched"
     store.alarms.append(filled.machine, number, 3, AlarmKind.ORDERED, AlarmFacts(name="petra"))
     assert states(reader, number) | {"cause": "now", "proposal": "waiting"} == states(reader, number), (
         "a proposal of before is none of this search"
