@@ -51,7 +51,7 @@ def promise(found: ProposalSummary) -> str:
     before, after, expanded = (
         frame.length(f"{value:.2f}" if frame.units == INCH else f"{value:.1f}") for value in (p.before, p.after, 2.0 * p.u_model)
     )
-    return f"{before} → {after} {unit} (U = {expanded} {unit})"
+    return f"{before} → {after} {unit} (U = {expanded} {unit}, k = 2)"
 
 
 def proposal_screen(reader: Reader, number: int) -> ProposalScreen:
