@@ -116,9 +116,12 @@ class SolutionLine:
 
 @dataclass(frozen=True, slots=True)
 class ResultScreen:
-    """One solution. ``ranked``: empty if its document lacks the covariance; ``picture``: contributions that the runs show."""
+    """One solution. ``campaign_id``: number of its campaign, whose report holds it. ``ranked``: empty if its document lacks the covariance;
+    ``picture``: contributions that the runs show.
+    """
 
     line: SolutionLine
+    campaign_id: int
     text: str
     ranked: Sequence[Ranked]
     picture: Markup
@@ -165,6 +168,7 @@ def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
     picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704
     return ResultScreen(
         _line(record, campaign.name),
+        campaign.id,
         "" if solution.verdict is None else solution.verdict.text,
         ranked,
         picture,

@@ -159,6 +159,8 @@ def test_runs_are_filtered(running: Served) -> None:
 def test_the_result_names_all_21_motions_and_those_that_do_not_show(running: Served, filled: Filled) -> None:
     with as_user(running, "vera") as client:
         page = client.get(f"/result?id={filled.solution}").text
+        (report,) = re.findall(r'href="(/api/v1/reports/campaign/\d+)"', page)
+        assert client.get(report).content.startswith(b"%PDF")
     motions = re.findall(r'data-motion="(\w+)"', page)
     assert len(set(motions)) == len(motions) == 21
     doc = running.store.solutions.get(filled.solution).doc
