@@ -81,7 +81,7 @@ def pose_readings(run: Run, data: RunData) -> Evaluated:
     """One pose as it was read, without the motion that fits it best: its features, their rms and their largest deviation.
 
     ``data``: observations of ``run``. The uncertainty is that of the touches alone. U of the largest deviation and of the arrows is that of
-    the largest of so many vectors (Sidak): noise alone exceeds it in 5 % of all poses.
+    the largest of so many vectors (Sidak): noise alone exceeds it in at most 5 % of all poses.
     """
     p = data.points
     assert p is not None

@@ -10,8 +10,10 @@ from pathlib import Path
 import pytest
 
 from abbe.service.config import key_lines, load_machine
+from abbe.service.config_schema import ROOM_K
 from abbe.service.errors import ConfigError
 from abbe.service.site import site_of
+from abbe.service.verification.verify import SAME_AIR_C
 
 GOOD = """
 name = "VMC-1"
@@ -110,6 +112,7 @@ LASER = 'laser = "modbus+rtu:///dev/ttyS0?baud=115200"\nfixture = "fixture+conso
 def test_the_air_of_a_shop_without_a_laser_is_stated_within_1_k(file: Path) -> None:
     file.write_text(GOOD.replace(LASER, f"{ROOM}[15.1, 16.1]\n").replace("[limits]", "[limits]\ntemperature_c = [15, 25]"))
     site = site_of(load_machine(file).machine)
+    assert ROOM_K == SAME_AIR_C, "what may be stated is what a verification accepts"
     assert (site.room_c, site.calibrated_until) == ((15.1, 16.1), {"room": date(2027, 5, 31)})
 
 
