@@ -92,7 +92,7 @@ LOOK_S = 10.0
 AGAIN_S = 1.0
 """Time after which a first difference is checked again, s: another process's push may have ended between two readings."""
 CODE = STRANGE_TABLE_CODE
-REMEDY = "find out who wrote it; restore the right table at the controller, or, if this one is right: abbe accept-table -m MACHINE.toml"
+REMEDY = "find out who wrote it; restore the right table, or have this one accepted if it is right (abbe accept-table -m MACHINE.toml)"
 """What to do about an unknown table. Not a rollback or a push: both are refused while it is active (`abbe.service.tables.table_gate`)."""
 
 

@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import re
 from datetime import UTC, datetime, tzinfo
 
 _UNITS = {"um": "µm", "urad": "µrad", "mm": "mm", "ppm": "ppm", "s": "s", "c": "°C", "percent": "%"}
+
+_COMMAND = re.compile(r"\babbe [a-z]{3}")
+_ASIDE = re.compile(r" ?[(（][^()（）]*\babbe [a-z]{3}[^()（）]*[)）]")
+_PARTS = re.compile(r"((?<=[;:.]) |(?<=。))")
 
 
 def stamp(time: datetime, zone: tzinfo = UTC) -> str:
@@ -27,3 +32,12 @@ def number(value: float | None) -> str:
         return "–"
     size = abs(value)
     return f"{value:.0f}" if size >= 100 else f"{value:.1f}" if size >= 1 else f"{value:.2f}"
+
+
+def without_commands(text: str) -> str:
+    """A told text without its parts that name a command of the command line: a person at the page has none."""
+    if not _COMMAND.search(text):
+        return text
+    parts = _PARTS.split(_ASIDE.sub("", text))
+    kept = [part + end for part, end in zip(parts[::2], [*parts[1::2], ""], strict=True) if not _COMMAND.search(part)]
+    return "".join(kept).rstrip(" ;:")

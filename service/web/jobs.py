@@ -15,6 +15,7 @@ from abbe.service.rendering.phrases import phrase
 from abbe.service.sequences.recipes.campaigns import named, split_recipe_name
 from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
+from abbe.service.web.formatting import without_commands
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
@@ -137,4 +138,7 @@ def answered(core: CoreLine, answer: Answer) -> Response:
 def _find(core: CoreLine, number: str) -> JobState | None:
     """The job, its sentences in the reader's language."""
     found, lang = next((job for job in core.jobs() if job.id == number), None), current().lang
-    return None if found is None else replace(found, text=phrase(lang, found.text), ask=phrase(lang, found.ask))
+    if found is None:
+        return None
+    text = phrase(lang, found.text)
+    return replace(found, text=without_commands(text) if current().csrf else text, ask=phrase(lang, found.ask))

@@ -95,7 +95,7 @@ def environment() -> Environment:
         "lengths": _lengths,
         "span": lambda seconds: language.span(current().lang, seconds),
         "picture": lambda svg: pictured(current().lang, svg),  # our own SVG writer has escaped every text
-        "say": lambda text: phrase(current().lang, str(text)),
+        "say": lambda text: formatting.without_commands(phrase(current().lang, str(text))),
     }
     env.tests["said"] = lambda text: is_whole(current().lang, str(text))
     env.globals |= template_functions() | {

@@ -14,12 +14,12 @@ import os
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page
+from playwright.sync_api import Browser
 
 from abbe.service.clock import SystemClock
 from abbe.service.config import load_machine
@@ -33,12 +33,18 @@ from abbe.service.verification.alarms import alarms_of
 from tests.pages_world import PHRASE
 from tests.pretended import as_if_commissioned, as_if_proved_for_nobody_there
 from tests.scenarios.conftest import Sims, simulated
+from tests.system.finger import Finger
 from tests.system.serve_bench import abbe, free_port
-from tests.system.test_serve_screens import BROKEN, INSIDE, SIZES, SMALL, Watch, axe, violations  # noqa: F401 - a fixture
+from tests.system.test_serve_screens import SIZES, Watch, axe  # noqa: F401 - a fixture
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 pytestmark = [pytest.mark.browser, pytest.mark.scenario, pytest.mark.timeout(1500)]
 SPEED = 50
+WALKS = [
+    ("1280", "light", "en"), ("1280", "dark", "ja"), ("1024", "dark", "en"),
+    ("1024", "light", "ja"), ("390", "light", "en"), ("390", "dark", "ja"),
+]  # fmt: skip
+"""Every size in both languages, and in light and dark."""
 DRIFT_UM_PER_M = 160.0
 # What the machine shows as it is made stays below; what the drift adds does not. A first table changes more than a table of a routine.
 TERMS = """\
@@ -89,58 +95,17 @@ def shop(tmp_path: Path) -> Iterator[Shop]:
             yield Shop(f"http://127.0.0.1:{port}", url, sims)
 
 
-@dataclass
-class Finger:
-    """What a person touches on one page, and the faults of each screen on the way."""
+def starts(finger: Finger) -> None:
+    """Confirm the checklist of a dry run, and start."""
+    for box in finger.page.locator("#start input[type=checkbox]").all():
+        finger.touch(box)
+    finger.touch("#start button[type=submit]")
+    finger.screen("/live")
 
-    page: Page
-    axe: str
-    touches: int = 0
-    counts: dict[str, int] = field(default_factory=dict)
-    bad: list[str] = field(default_factory=list)
 
-    def touch(self, what: Locator | str) -> None:
-        """Touch what is in reach: Playwright refuses what is covered or out of the window."""
-        (self.page.locator(what).first if isinstance(what, str) else what).tap()
-        self.touches += 1
-
-    def screen(self, path: str) -> None:
-        """Wait for a screen, and look for its faults."""
-        page = self.page
-        page.wait_for_url(f"**{path}**")
-        page.wait_for_selector("html[data-ready=yes]")
-        self.bad += [] if page.evaluate(INSIDE) else [f"{path}: scrolls sideways"]
-        self.bad += [f"{path}: broken word {one}" for one in page.evaluate(BROKEN)]
-        self.bad += [f"{path}: small target {one}" for one in page.evaluate(SMALL)]
-        self.bad += [f"{path}: {one}" for one in violations(page, self.axe, "{}")]
-
-    def shot(self, name: str) -> None:
-        folder = os.environ.get("ABBE_SHOTS")
-        if folder:
-            self.page.screenshot(path=f"{folder}/{name}.png", full_page=True)
-
-    def counted(self, what: str, since: int) -> int:
-        self.counts[what] = self.touches - since
-        return self.counts[what]
-
-    def logs_in(self, base: str, name: str) -> None:
-        """Typed, not touched."""
-        self.page.goto(f"{base}/login")
-        self.page.fill("#name", name)
-        self.page.fill("#password", PHRASE)
-        self.page.tap("button[type=submit]")
-        self.screen("/")
-
-    def starts(self) -> None:
-        """Confirm the checklist of a dry run, and start."""
-        for box in self.page.locator("#start input[type=checkbox]").all():
-            self.touch(box)
-        self.touch("#start button[type=submit]")
-        self.screen("/live")
-
-    def waits(self, ms: float) -> None:
-        """Wait for the end of the run on its screen."""
-        self.page.wait_for_selector("#live-over:not([hidden])", timeout=ms)
+def waits(finger: Finger, ms: float) -> None:
+    """Wait for the end of the run on its screen."""
+    finger.page.wait_for_selector("#live-over:not([hidden])", timeout=ms)
 
 
 def quick_check(finger: Finger) -> None:
@@ -148,9 +113,9 @@ def quick_check(finger: Finger) -> None:
     before = finger.touches
     finger.touch("a.main[href='/new?recipe=quick-check']")
     finger.screen("/new")
-    finger.starts()
+    starts(finger)
     assert finger.counted("quick check", before) == 3
-    finger.waits(CHECK_MS)
+    waits(finger, CHECK_MS)
     finger.touch("#live-check a")
     finger.screen("/check")
 
@@ -162,16 +127,17 @@ def to_the_alarm(finger: Finger) -> None:
     finger.screen("/alarm")
 
 
-@pytest.mark.skipif(not LONG, reason="five minutes on a simulated machine: ABBE_TEST_LONG=1 walks the whole way")
-@pytest.mark.parametrize(("size", "lang"), [("1280", "en"), ("390", "ja")])
+@pytest.mark.skipif(not LONG, reason="three minutes a walk on a simulated machine: ABBE_TEST_LONG=1 walks the whole way")
+@pytest.mark.parametrize(("size", "scheme", "lang"), WALKS)
 def test_on_a_prepared_machine_a_drift_is_followed_to_the_signed_report(
     chromium: Browser,
     shop: Shop,
     axe: str,  # noqa: F811 - the fixture
     size: str,
+    scheme: str,
     lang: str,
 ) -> None:
-    options: Any = {"viewport": SIZES[size], "locale": lang, "has_touch": True}
+    options: Any = {"viewport": SIZES[size], "color_scheme": scheme, "locale": lang, "has_touch": True}
     with closing(chromium.new_context(**options)) as context:
         page = context.new_page()
         watch, finger = Watch(page, shop.base), Finger(page, axe)
@@ -187,15 +153,16 @@ def test_on_a_prepared_machine_a_drift_is_followed_to_the_signed_report(
 
         to_the_alarm(finger)
         finger.touch("form[action='/alarm/acknowledge'] button")
-        page.wait_for_selector("form[action='/alarm/acknowledge']", state="detached")
+        finger.screen("/alarm")
+        assert page.locator("form[action='/alarm/acknowledge']").count() == 0
         finger.shot("alarm")
         before = finger.touches
         finger.touch(".path .go.main")
         finger.screen("/new")
         finger.shot("new")
-        finger.starts()
+        starts(finger)
         finger.counted("search for the cause", before)
-        finger.waits(CAMPAIGN_MS)
+        waits(finger, CAMPAIGN_MS)
         finger.shot("searched")
         finger.touch("#live-made a")
         finger.screen("/proposal")
@@ -231,9 +198,9 @@ def test_on_a_prepared_machine_a_drift_is_followed_to_the_signed_report(
         before = finger.touches
         finger.touch(".path .go.main")
         finger.screen("/new")
-        finger.starts()
+        starts(finger)
         finger.counted("proof", before)
-        finger.waits(CHECK_MS)
+        waits(finger, CHECK_MS)
         finger.touch("#live-check a")
         finger.screen("/check")
         finger.shot("proof")

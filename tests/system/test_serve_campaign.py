@@ -210,7 +210,8 @@ def test_a_browser_leads_from_the_checklist_through_the_set_ups(tmp_path: Path) 
         screen.click("#steer [data-how=stop]")
         screen.wait_for_selector("#live-over:not([hidden])", timeout=60_000)
         assert screen.inner_text("#live-outcome") == "The run has ended: done: stopped"
-        assert "--resume" in screen.inner_text("#live-text")
+        assert "are kept" in screen.inner_text("#live-text")
+        assert "abbe" not in screen.inner_text("#live-text"), "a person at the page has no command line"
         assert screen.locator("#by-hand").count() == 0
         assert seen.errors == []
         assert only_us(seen)

@@ -9,22 +9,24 @@ from __future__ import annotations
 import asyncio
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
 import pytest
-from playwright.sync_api import Browser, Locator, Page, Route
+from playwright.sync_api import Browser, Route
 
 from abbe.service.clock import SystemClock
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
 from abbe.service.verification.alarms import READ_CHECKS, check_facts, evaluate_alarm
-from tests.pages_world import PHRASE, Filled, Served, filled_once, served
+from tests.pages_world import PHRASE, Filled, filled_once, served
 from tests.pretended_push import KEPT, as_if_pushed
+from tests.system.finger import Finger
 from tests.system.serve_check import Result
-from tests.system.test_serve_screens import BROKEN, INSIDE, LONG, SIZES, SMALL, Watch, axe, violations  # noqa: F401 - a fixture
+from tests.system.test_serve_screens import LONG, SIZES, Watch, axe, violations  # noqa: F401 - a fixture
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(240)]
 RECIPE = "verify"
@@ -72,30 +74,14 @@ def filled(tmp_path_factory: pytest.TempPathFactory) -> Filled:
     return filled_once(tmp_path_factory)
 
 
-class Walk:
-    """A person with a finger."""
+@dataclass
+class Walk(Finger):
+    """A person who sees the alarm on every screen."""
 
-    def __init__(self, page: Page, running: Served, axe: str, rules: str) -> None:  # noqa: F811
-        self.page, self.running, self.axe, self.rules = page, running, axe, rules
-        self.touches = 0
-        self.bad: list[str] = []
-
-    def touch(self, what: Locator | str) -> None:
-        """Touch something that is in reach: Playwright refuses what is covered or out of the window."""
-        where = self.page.locator(what).first if isinstance(what, str) else what
-        where.tap()
-        self.touches += 1
-
-    def look(self, path: str) -> None:
+    def look(self, address: str) -> None:
         """Wait for a screen, and find its faults."""
-        page = self.page
-        page.wait_for_url(f"{self.running.base}{path}**")
-        page.wait_for_selector("html[data-ready=yes]")
-        assert page.locator(".strip .count").inner_text().startswith("▲"), "an alarm is present, and shown"
-        self.bad += [] if page.evaluate(INSIDE) else [f"{path}: scrolls sideways"]
-        self.bad += [f"{path}: broken word {one}" for one in page.evaluate(BROKEN)]
-        self.bad += [f"{path}: small target {one}" for one in page.evaluate(SMALL)]
-        self.bad += [f"{path}: {one}" for one in violations(page, self.axe, self.rules)]
+        self.screen(address)
+        assert self.page.locator(".strip .count").inner_text().startswith("▲"), "an alarm is present, and shown"
 
     def step(self, name: str) -> None:
         """Touch a step of the way."""
@@ -122,19 +108,15 @@ def test_from_a_drift_to_the_report_by_touches(chromium: Browser, tmp_path_facto
 
         page.route(f"**/api/v1/proposals/{proposal}/push", push)
         page.route("**/api/v1/jobs/*", lambda route: route.fulfill(json={"state": "done: kept", "text": "", "ended_utc": "2026-01-01"}))
-        page.goto(f"{running.base}/login")
-        page.fill("#name", "anna")
-        page.fill("#password", PHRASE)
-        page.tap("button[type=submit]")
-
-        walk = Walk(page, running, axe, "{}" if LONG or scheme == "light" else "{runOnly: ['color-contrast']}")
-        walk.look("/")
+        walk = Walk(page, axe, "{}" if LONG or scheme == "light" else "{runOnly: ['color-contrast']}")
+        walk.logs_in(running.base, "anna")
         walk.touch(".strip .count")
         walk.look("/alarms")
         walk.touch(page.locator(f"a[href='/alarm?id={number}']").last)
         walk.look(f"/alarm?id={number}")
         walk.touch("form[action='/alarm/acknowledge'] button")
-        page.wait_for_selector("form[action='/alarm/acknowledge']", state="detached")
+        walk.look(f"/alarm?id={number}")
+        assert page.locator("form[action='/alarm/acknowledge']").count() == 0
         walk.step("check")
         walk.look("/check")
         walk.step("cause")

@@ -117,7 +117,7 @@ class SolutionLine:
 @dataclass(frozen=True, slots=True)
 class ResultScreen:
     """One solution. ``campaign_id``: number of its campaign, whose report holds it. ``ranked``: empty if its document lacks the covariance;
-    ``picture``: contributions that the runs show.
+    ``picture``: contributions that the runs show; ``runs``: the number of each run (None: it is not stored here), and its cells.
     """
 
     line: SolutionLine
@@ -128,7 +128,7 @@ class ResultScreen:
     not_observable: Sequence[str]
     advice: Sequence[str]
     budget: Sequence[tuple[str, str, str]]
-    runs: Sequence[tuple[str, str, str, str, str]]
+    runs: Sequence[tuple[int | None, Sequence[str]]]
     flags: Sequence[str]
 
     @property
@@ -164,6 +164,7 @@ def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
     solution, campaign = stored_solution(record.doc, record.id), store.campaigns.find(record.campaign_id)
     ranked = _ranked(solution, store.machines.get(campaign.machine_id).doc)
     shown = [r.contribution for r in ranked if not r.hidden]
+    known = {run.label: run.id for run in store.runs.all(campaign.id) if run.id in record.run_ids}
     # The SVG writer has already escaped every text.
     picture = Markup(contribution_bars(shown, unit=current().drawn())) if shown else Markup("")  # noqa: S704
     return ResultScreen(
@@ -175,7 +176,7 @@ def result_screen(store: Store, record: SolutionRecord) -> ResultScreen:
         solution.not_observable,
         solution.advice,
         [(b.text, plain(b.u_um, 2), f"{b.share:.0%}") for b in solution.uncertainty.budget],
-        [(k, str(r.readings), plain(r.rms_um), plain(r.expected_um), str(r.outliers)) for k, r in solution.runs.items()],
+        [(known.get(k), (k, str(r.readings), plain(r.rms_um), plain(r.expected_um), str(r.outliers))) for k, r in solution.runs.items()],
         solution.flags,
     )
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import secrets
+from collections.abc import Callable
 from functools import partial
 from typing import Annotated
 
@@ -12,6 +13,7 @@ from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Resp
 from pydantic import AfterValidator
 
 from abbe.service.compensation.proposal_decisions import approve as work_approve
+from abbe.service.compensation.proposal_decisions import reject as work_reject
 from abbe.service.compensation.proposal_decisions import same_person
 from abbe.service.errors import AbbeError, NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
@@ -20,6 +22,7 @@ from abbe.service.queries.results import discoveries
 from abbe.service.queries.tables import proposals
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
+from abbe.service.rendering.phrases import phrase
 from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.frame import current
@@ -28,6 +31,7 @@ from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.login import signature_refusal
 from abbe.service.web.page import has_uplot
 from abbe.service.web.pages import times
+from abbe.service.web.pages.audit import add_audit
 from abbe.service.web.pages.context import Number, PageContext, can_be_stored, find_or_none
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
@@ -53,6 +57,7 @@ def themed(rules: str) -> str:
 
 
 LONGEST_FORM = 4096
+LONGEST_REASON = 500
 HOURS = (1.0, 8.0, 24.0, 72.0)
 Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
@@ -72,7 +77,9 @@ def add_pages(app: FastAPI, context: PageContext) -> None:
     add_result_pages(app, context)
     _add_proposals(app, context)
     _add_approval(app, context)
+    _add_rejection(app, context)
     _add_times(app, context)
+    add_audit(app, context)
 
 
 def _add_runs(app: FastAPI, context: PageContext) -> None:
@@ -195,16 +202,39 @@ def _add_approval(app: FastAPI, context: PageContext) -> None:
         refused = await signature_refusal(context.auth, request, form.get("password", ""))
         if refused is not None:
             return refused
-        account = visit.principal.name
-        name = account.partition(":")[2].partition("/")[0]
-        try:
-            await context.read(work_approve, context.store, number, name, hours, context.reader.clock, account)
-        except TableRefused as error:
-            return problem(409, str(error), error.code)
-        except NotStored as error:
-            return problem(404, error.detail, error.code)
+        account, clock = visit.principal.name, context.reader.clock
+        refused = await _decided(context, lambda: work_approve(context.store, number, current().who, hours, clock, account))
+        if refused is not None:
+            return refused
         # What was signed is usually wanted at once: the screen asks for the push, and the person's touch orders it.
         return RedirectResponse(f"/proposal?id={number}" + ("" if context.pushes_itself else "&push=ask"), 303)
+
+
+def _add_rejection(app: FastAPI, context: PageContext) -> None:
+    @app.post("/proposal/reject", include_in_schema=False, max_body_size=LONGEST_FORM)
+    @needs(Permission.APPROVE)
+    async def reject(request: Request) -> Response:
+        visit: Visit = request.state.visit
+        form = await form_of(request) or {}
+        number = form.get("number", "")
+        if not re.fullmatch(r"[1-9]\d{0,8}", number, re.ASCII):
+            return problem(422, "the form needs the number of a proposal")
+        reason = form.get("reason", "").replace("\0", "\ufffd")[:LONGEST_REASON]
+        visit.target = f"proposal {number}: {reason}"
+        account, clock = visit.principal.name, context.reader.clock
+        work = lambda: work_reject(context.store, int(number), current().who, reason, clock, account)  # noqa: E731
+        return await _decided(context, work) or RedirectResponse(f"/proposal?id={number}", 303)
+
+
+async def _decided(context: PageContext, work: Callable[[], object]) -> Response | None:
+    """Make a decision; its refusal, or None."""
+    try:
+        await context.read(work)
+    except TableRefused as error:
+        return problem(409, phrase(current().lang, error.detail), error.code)
+    except NotStored as error:
+        return problem(404, error.detail, error.code)
+    return None
 
 
 def _approval(fields: dict[str, str]) -> tuple[int, float] | None:
@@ -232,9 +262,3 @@ def _add_times(app: FastAPI, context: PageContext) -> None:
     async def schedule() -> HTMLResponse:
         status = await context.source.status()
         return await context.show("schedule.html", lines=await context.read(times.schedule_lines, context.reader, status))
-
-    @app.get("/audit", include_in_schema=False)
-    @needs(Permission.AUDIT)
-    async def audit() -> HTMLResponse:
-        records = await context.read(context.store.audit.events, times.AUDIT_ROWS)
-        return await context.show("audit.html", records=list(reversed(records)))

@@ -30,7 +30,6 @@ from abbe.service.web.units import converted
 CHECKS = 366
 """Number of latest checks in a trend: a year of daily ones."""
 SLOTS = 30
-AUDIT_ROWS = 200
 PLOT_WORDS = ("check.open", "plot.at", "plot.share", "verdict.cannot tell", "verdict.fail", "verdict.pass")
 VERDICTS = ("pass", "cannot tell", "fail")
 

@@ -11,6 +11,7 @@ import pytest
 
 from abbe.drivers.fixture.driver import ConsoleFixture
 from abbe.service.rendering.phrases import FOLDER, LANGUAGES, phrase, pictured
+from abbe.service.web.formatting import without_commands
 from tests.languages import english
 from tests.pages_world import as_user, filled_once, screens, served
 
@@ -25,7 +26,7 @@ def texts(page: str) -> list[str]:
 
 
 def test_every_screen_is_in_its_language(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """In a world of its own: other tests write remarks into the common one."""
+    """In a world of its own: other tests write remarks into the common one. None tells a person to type a command."""
     left: dict[str, str] = {}
     with served(filled_once(tmp_path_factory)) as running:
         read = {}
@@ -37,6 +38,8 @@ def test_every_screen_is_in_its_language(tmp_path_factory: pytest.TempPathFactor
                 originals = frozenset(read["en"][path])
                 left |= {f"{lang} {text}": path for text in found if english(lang, text, originals)}
     assert not left, "\n".join(f"{text}  {where}" for text, where in sorted(left.items()))
+    shown = [(path, text) for some in read.values() for path, found in some.items() for text in found]
+    assert [(path, text) for path, text in shown if without_commands(text) != text and " · " not in text] == []
 
 
 def test_a_report_of_the_page_is_in_the_readers_language(tmp_path_factory: pytest.TempPathFactory) -> None:

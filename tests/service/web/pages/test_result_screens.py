@@ -197,3 +197,10 @@ def test_a_difference_counts_the_mounting_and_names_direction_and_feed(running: 
 def test_a_run_compared_with_itself_measured_again_differs_by_nothing(running: Served) -> None:
     a = runs_of(running, "laser_diagonal")[0]
     assert "B − A" not in got(running, f"/compare?run={a}&run={a}")  # the same run twice is one run
+
+
+def test_every_run_of_a_solution_leads_to_its_screen(running: Served) -> None:
+    page = got(running, f"/result?id={running.filled.solution}").partition('id="h-runs"')[2]
+    links = re.findall(r'<th scope="row"><a href="/run\?id=(\d+)">([^<]*)</a></th>', page)
+    assert len(links) == page.count('<th scope="row">') > 5
+    assert all(running.store.runs.find(int(number)).label == label for number, label in links)
