@@ -33,7 +33,7 @@ class DeviceInfo:
 class BarSample(NamedTuple):
     """One ball-bar sample (docs/protocols/ballbar.md). A plain tuple: thousands are made every second.
 
-    ``status``: bits of `abbe.drivers.api.BarFlag`; the driver of another box translates its own.
+    ``status``: bits of `abbe.drivers.api.BarFlag`; the driver of another box converts that box's status bits to them.
     """
 
     seq: int
@@ -72,8 +72,8 @@ class BarTap(Protocol):
 class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
-    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument translates its own. ``refractivity``: n - 1 of air.
-    What an instrument does not measure of the air is NaN (`air_doc`).
+    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument converts its status bits to them. ``refractivity``:
+    n - 1 of air. Values of the air that the instrument does not measure are NaN (`air_doc`).
     """
 
     host_s: float
@@ -89,7 +89,7 @@ class LaserReading:
 
 
 class Condition(Flag):
-    """Conditions of a controller. Drivers map their status bits to these; the numbers appear on no wire."""
+    """Conditions of a controller. Drivers map their status bits to these; no device sends these numbers."""
 
     ESTOP = auto()
     DOOR_OPEN = auto()
@@ -180,7 +180,7 @@ class BankState(StrEnum):
     WRITING = "being written"
     SEALED = "sealed"
     LAID_ASIDE = "laid aside"
-    """Sealed, and takes effect after the control's next start."""
+    """The table is sealed; it takes effect after the control's next start."""
     OFF = "switched off"
     """Compensation is off, so the table does not act (controls with one table, `OneBank`)."""
     UNKNOWN = "unknown"
@@ -226,7 +226,7 @@ class BallBar(Protocol):
 
 
 class DisplacementMeter(Protocol):
-    """A laser Doppler displacement meter, or any other; positive: the target moves away from the instrument.
+    """A laser Doppler displacement meter or another displacement sensor; positive: the target moves away from the instrument.
 
     Every call has its own time-out. After a lost connection the driver connects again with the next call; the zero may be lost then.
     """
@@ -238,10 +238,10 @@ class DisplacementMeter(Protocol):
         """Make the present position 0. Raises DeviceFault where the device gives no valid reading."""
 
     async def clear_beam(self) -> None:
-        """Clear the mark of a lost beam, if the device keeps one. It must be zeroed again afterwards."""
+        """Clear the mark of a lost beam, if the device keeps one. The device must be zeroed again afterwards."""
 
     async def set_environment_compensation(self, on: bool) -> None:
-        """Have the device correct its wavelength for the air, or not; a device without such a correction does nothing."""
+        """Switch the device's correction of the wavelength for the air on or off; do nothing if the device has none."""
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
         """Wait for a sample whose ``sample_count`` is not ``after_count``; ``host_s`` is `time.monotonic` of its arrival.

@@ -79,7 +79,7 @@ class DeviceValue(DeviceTable):
 
 
 class IdentityRegisters(DeviceTable):
-    """Registers whose content identifies the device. Several registers with a content without symmetry also prove the byte order."""
+    """Registers whose content identifies the device. Two or more registers with asymmetric content also prove the byte order."""
 
     address: Register
     type: Type = "u16"
@@ -284,7 +284,7 @@ def checked(doc: dict[str, Any], where: str) -> DeviceFile:
 
 
 def _tuples(value: Any) -> Any:
-    """Return a document with tuples for lists: strict models want them. TOML's whole numbers pass as numbers with a point."""
+    """Return a document with tuples in place of lists, as strict models require. These models accept TOML's integers as floats."""
     if isinstance(value, dict):
         return {key: _tuples(inner) for key, inner in value.items()}
     return tuple(_tuples(inner) for inner in value) if isinstance(value, list) else value

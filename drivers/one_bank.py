@@ -57,7 +57,7 @@ class OneBankTables:
         Raises
         ------
         DeviceFault
-            They keep changing.
+            State or table keep changing.
         """
         state, store = await self._c.table_state(), await self._c.read_table()
         for _ in range(TRIES):
@@ -81,7 +81,7 @@ class OneBankTables:
         Raises
         ------
         Refused
-            It is given to another owner.
+            Another owner has the lease.
         """
         if self._owner not in (0, owner):
             raise Refused("one table", "take the lease", "another push of this process has it")
@@ -117,7 +117,7 @@ class OneBankTables:
         Raises
         ------
         Refused
-            It has no image, or another session holds the lease.
+            The staged table has no image, or another session holds the lease.
         """
         if owner != self._owner or bank == self._active or not self._staged or image_in(bytes(self._staged)) != self._staged:
             raise Refused("one table", f"seal bank {bank}", "no image is staged in it, or the lease is not ours")

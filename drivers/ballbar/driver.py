@@ -39,7 +39,7 @@ _RESTORE = "set unit, range and zero of the box back, then measure this test aga
 
 
 class Box:
-    """Watches that identity and settings of a box stay the same. ``serial_no``: the only accepted box; None: the first that answers."""
+    """Verifies that identity and settings of a box stay the same. ``serial_no``: the only accepted box; None: the first that answers."""
 
     def __init__(self, name: str, talk: Conversation, serial_no: int | None) -> None:
         self.boot_id: int | None = None
@@ -348,7 +348,7 @@ class SerialBallBar:
             raise waited
 
     async def _delivered(self) -> bool:
-        """Wait until the tap has all received samples; at once if STOP was answered. Return False if it takes too long."""
+        """Wait until the tap has all received samples. Return False if it takes too long."""
         return self._framing is None or self._stream is None or self._stream.tap is None or await self._framing.drained(_DRAIN_S)
 
     async def close(self) -> None:

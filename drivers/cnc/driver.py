@@ -55,7 +55,7 @@ class ModbusController(Banks):
         return (await self.block()).probe
 
     async def touch(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> Latch | None:
-        """Move as `move`, but the axes stop when the touch probe trips; return where it tripped, None at the target without a trip.
+        """Move as `move` does, but stop the axes when the touch probe trips; return the position of the trip, None if it did not trip.
 
         Raises
         ------

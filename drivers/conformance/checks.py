@@ -89,7 +89,7 @@ async def rate(probe: DeviceUnderTest, file: DeviceFile | None) -> list[DeviceCh
 
 
 def _wrong_by_driver(sample: Sample, taken: list[Sample], asked_s: float) -> DeviceCheck | None:
-    """What only a driver can do wrong: it gives a sample twice, or a time that is not this computer's."""
+    """Check for faults that only a driver can cause: a sample returned twice, or a time that is not this computer's."""
     if taken and sample.number == taken[-1].number:
         return DeviceCheck("freshness", FAILED, f"read(after_count={sample.number}) returned sample {sample.number} again")
     if not asked_s - BUFFERED_S <= sample.host_s <= time.monotonic():
@@ -189,7 +189,7 @@ async def _words(probe: DeviceUnderTest, name: str) -> tuple[int, ...]:
 
 
 def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
-    """Return the fault of a motion as it was read, and ``where`` to correct it; empty without a fault."""
+    """Return the fault of a motion as it was read, and its correction in the ``where`` (device file or driver); empty without one."""
     if abs(got_mm - move.mm) <= move.tolerance_mm:
         return ""
     read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"

@@ -124,7 +124,7 @@ async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Res
 
 
 async def _closed(probe: DeviceUnderTest) -> None:
-    """Close a device; what its driver does wrong then was found before, or spoils no reading."""
+    """Close a device. Ignore defects of its driver: they were found before, or affect no reading."""
     with suppress(DriverDefect):
         await probe.close()
 
@@ -139,7 +139,7 @@ async def _rest(probe: DeviceUnderTest, least: float) -> _Rest:
 
 
 async def _zeroed(probe: DeviceUnderTest) -> None:
-    """After a new connection a zero may be lost; a device that is still silent is asked again by the next reading."""
+    """Zero the device again: a new connection may lose the zero. A device that does not answer is asked again by the next reading."""
     try:
         await probe.zero()
     except DriverError:

@@ -1,6 +1,6 @@
 """A control that is only listened to: it shows positions and states, or nothing at all. It never moves and holds no tables.
 
-So `abbe listen` works at a machine whose control has no interface, or a digital read-out, or a PLC with three positions.
+With it, `abbe listen` works at a machine whose control has no interface, only a digital read-out, or a PLC with three positions.
 """
 
 from __future__ import annotations

@@ -59,7 +59,7 @@ class LineSource:
         DeviceFault
             The device reports an error.
         BadFrame
-            It answers something else.
+            The device answers something else.
         """
         await self._opened()
         if await self._ask(command.send, command.answer) is None:
@@ -88,7 +88,7 @@ class LineSource:
         return None if found is None else {key: value for key, value in found.groupdict().items() if value is not None}
 
     async def _silence(self) -> None:
-        """Drop what comes until nothing has come for a whole timeout."""
+        """Drop incoming bytes until the line has been silent for a whole timeout."""
         for _ in range(_SILENCES):
             try:
                 await self._link.read(_MOST_BYTES, timeout_s=self._table.timeout_s)

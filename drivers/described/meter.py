@@ -23,7 +23,7 @@ LOSES_ZERO = {"beam lost", "no reflector", "fault"}
 """States after which an incremental instrument must be zeroed anew."""
 TENTH_NM_PER_MM = 1e7
 SOON_S = 10.0
-"""A count of 16 bits does not pass half of its range in this time, at up to 1000 readings a second and more."""
+"""A 16-bit counter of up to 1000 readings a second and more does not pass half of its range in this time."""
 NEW_S = 2.0
 """Longest wait for a new reading; a device that shows an old one longer is stuck."""
 ZEROED_MM = 0.05
@@ -173,7 +173,10 @@ class DescribedMeter:
         return self._count
 
     def _step(self, name: str, raw: float, *, soon: bool) -> float:
-        """Add the change of a count that may wrap to its total, and return it; raise Rebooted if it went back ``soon`` after the last."""
+        """Add the change of a count, which may wrap, to its total, and return the change.
+
+        Raises Rebooted if the count went back. If it is read ``soon`` after the last time, a change above half its range counts as back.
+        """
         value, before = self.file.values[name], self._raw.get(name)
         step = raw if before is None else raw - before
         size = float("inf")

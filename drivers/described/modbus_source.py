@@ -24,7 +24,7 @@ ORDER_NAMES = {
 
 
 def canary_of(file: DeviceFile) -> Canary | None:
-    """Return the first known content of at least two registers, by which an RTU line proves itself; None without one."""
+    """Return the canary that verifies an RTU line: the first known content of at least two registers; None if there is none."""
     table = file.modbus
     known = next((one for one in file.identity if SIZE[one.type] > 1), None)
     if table is None or known is None:
@@ -53,7 +53,7 @@ class ModbusSource:
         Raises
         ------
         WrongDevice
-            They hold something else; the message names the byte order in which they would fit.
+            The identity registers hold something else; the message names the byte order in which they would fit.
         LinkDown, ReplyTimeout, BadFrame, Refused, DeviceFault
             Communication failed.
         """

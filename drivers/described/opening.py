@@ -70,7 +70,7 @@ async def open_meter(url: DeviceUrl, *, needed: Ability | None = None) -> Descri
     BadDeviceFile, BadUrl
         The device file cannot be used, describes another kind of device, or another wire.
     NotProved
-        `check_tested`.
+        As for `check_tested`.
     WrongDevice, LinkDown, ReplyTimeout, BadFrame, DeviceFault
         Another device, or communication failed.
     """

@@ -27,7 +27,7 @@ def _ordered(data: bytes, order: Order) -> bytes:
 
 
 def decode(words: Sequence[int], kind: Type, order: Order) -> float:
-    """Return the number in the registers of one value. An integer stays one, so that its bits can be read."""
+    """Return the number in the registers of one value. An integer type gives an int, so that its bits can be read."""
     number: float = struct.unpack(f">{_FORMAT[kind]}", _ordered(bytes_of(words), order))[0]
     return number
 

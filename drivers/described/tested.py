@@ -34,7 +34,7 @@ class CheckVerdict(StrEnum):
     PASSED = "passed"
     FAILED = "failed"
     NOT_PROVED = "not proved"
-    """It was not tried, or cannot be proved for this device."""
+    """The check was not made, or is impossible for this device."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     path : str
         The report; empty: there is none.
     sha256, serial_no : str
-        Of the device file, and of the device that answers now: the report must be about both.
+        SHA-256 of the device file and serial number of the device that answers now; the report must state the same.
     needed : Ability
         What the job needs.
 
