@@ -205,7 +205,7 @@ class Fixture:
         return {}
 
     async def _reset(self, request: Answer) -> Answer:
-        """Act as the operator at the panel: release all switches, reset the alarm, switch the drives on."""
+        """Do what the operator does at the panel: release all switches, reset the alarm, switch the drives on."""
         controller = self._world.controller
         controller.set_estop(pressed=False)
         controller.set_door(is_open=False)

@@ -96,7 +96,7 @@ class World:
         self.air.warmer_c += plus_c
 
     def _felt(self, start_mm: F, target_mm: F, feed_mm_min: float) -> Felt:
-        """Return the contacts of the probe on a straight move from now on; the lost motion is as the axes stand, and is not changed."""
+        """Return the contacts of the probe on a straight move from now on, without changing the present state of the lost motion."""
         way, length = target_mm - start_mm, float(np.linalg.norm(target_mm - start_mm))
         if not self.table.fitted or length == 0.0:
             return NOTHING

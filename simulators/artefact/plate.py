@@ -63,7 +63,7 @@ def draw_plate(config: ArtefactConfig, seed: int) -> Plate:
 
 @dataclass(frozen=True, slots=True)
 class Mounting:
-    """How the plate lies: ``origin_mm`` (3,) and axes ``matrix`` (3, 3) in workpiece coordinates, and the change of that since ``since_s``.
+    """How the plate lies: ``origin_mm`` (3,) and axes ``matrix`` (3, 3) in workpiece coordinates, valid at the time ``since_s``.
 
     ``drift_mm_s``: velocity of the origin, shape (3,); ``bend_mm``: shift of x and of y by the clamps, as coefficients of x², xy and y²,
     where x and y are in units of 100 mm, shape (2, 3).

@@ -12,12 +12,12 @@ from abbe.simulators.scenario import Scenario
 
 COARSE_MM, FINE_MM = 0.25, 0.01
 CRASH_MM = 1.0
-"""Deeper in the material than this a stylus breaks."""
+"""Depth in the material beyond which the stylus breaks."""
 OVERTRAVEL_S = 0.002
-"""From the trip to the axes' stop."""
+"""Time from the trip until the axes stop."""
 
 Tip = Callable[[F], F]
-"""Shares (n,) of a straight move, in order, to the places of the stylus tip, (n, 3) mm in workpiece coordinates."""
+"""Maps fractions (n,) of a straight move, in ascending order, to positions of the stylus tip, (n, 3) mm in workpiece coordinates."""
 
 
 class PlateUnderProbe:
@@ -35,11 +35,11 @@ class PlateUnderProbe:
 
     @property
     def fitted(self) -> bool:
-        """Whether the probe is in the spindle, and whole."""
+        """Whether the probe is in the spindle and not broken."""
         return self._mounting is not None and not self.stylus.broken
 
     def mount(self, origin_mm: F, matrix: F, time_s: float) -> None:
-        """Put the plate at the axis position ``origin_mm`` of its zero, its axes along the columns of ``matrix``, and fit the probe."""
+        """Put the plate's zero at the axis position ``origin_mm``, its axes along the columns of ``matrix``, and fit the probe."""
         self._count += 1
         self.stylus.broken = False
         origin = origin_mm + self._tool_mm
@@ -78,7 +78,7 @@ class PlateUnderProbe:
         return self._first_below(-CRASH_MM, length_mm, tip, time_s) if self.fitted else None
 
     def _first_below(self, level_mm: float, length_mm: float, tip: Tip, time_s: float) -> float | None:
-        """Return where on a move the free way first falls below a level, found on a coarse grid and refined near it."""
+        """Return the length of a move, mm, after which the clearance first falls below a level (coarse grid, then a fine one near it)."""
         coarse = np.linspace(0.0, 1.0, max(2, int(np.ceil(length_mm / COARSE_MM)) + 1))
         free = self._free(tip(coarse), time_s)
         if free[0] < level_mm:

@@ -67,7 +67,7 @@ class BallbarDevice:
         self._mounts = 0
         self._pushed = False
         self.too_much: Callable[[F, float, float], F] | None = None
-        """Hidden effect: error of the readings (n,) mm from times (n,) s, the time when the bar was mounted (s), and its length (mm)."""
+        """Hidden effect: maps times (n,) s, the time when the bar was mounted (s) and its length (mm) to errors of the readings (n,) mm."""
         self._noise = generator(draws.seed, STREAM_BAR_NOISE)
         self._taken: list[_Taken] = []
         self._ready: list[Samples] = []

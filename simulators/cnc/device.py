@@ -187,7 +187,7 @@ class Felt:
 
 NOTHING = Felt()
 Feel = Callable[[F, F, float], Felt]
-"""Start and target (3,) mm and feed (mm/min) of a straight move to what it meets."""
+"""Maps start and target (3,) mm and feed (mm/min) of a straight move to its contacts."""
 
 
 class Hold(IntEnum):
@@ -434,7 +434,7 @@ class Controller:
     # ---- inner ---------------------------------------------------------------------------------------------------
 
     def _go(self, target_mm: F, feed_mm_min: float, crash_mm: float | None) -> None:
-        """Start a straight motion that may end in a crash after some way."""
+        """Start a straight motion. With ``crash_mm`` it ends in a crash after this length."""
         self.latch_mm, self._trip_mm, self._crash = None, None, crash_mm is not None
         end = target_mm
         if crash_mm is not None:

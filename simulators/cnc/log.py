@@ -17,7 +17,7 @@ class Command:
 
     @property
     def moves(self) -> bool:
-        """Whether it is a motion or path command, or resumes a motion; holding or aborting one does not count."""
+        """Whether the command is a motion or path command, or resumes a motion; hold and abort do not count."""
         return self.kind in MOTION or (self.kind == "run" and self.moving)
 
 

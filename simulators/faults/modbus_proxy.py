@@ -21,7 +21,7 @@ class ModbusProxy:
     """Listens on 127.0.0.1 and passes frames between host and device, with the faults of a scenario.
 
     Besides the kinds of ``modbus_toxics`` it plays three that count connections: ``accept_then_close`` (closes a connection after accepting
-    it), ``one_socket`` (does the same while another connection is open), ``kick_oldest`` (closes the older connections at a new one).
+    it), ``one_socket`` (does the same while another connection is open), ``kick_oldest`` (closes older connections when a new one opens).
 
     Parameters
     ----------

@@ -2,8 +2,8 @@
 
 This file also cuts MBAP (TCP) and RTU frames out of a stream, decodes and encodes them, and answers requests from a register map.
 
-A fault hits a request and its reply: request number ``at`` (from 0) of those of sort ``on``: any, read, write, or one with a first register
-(``write 64``). The kinds, and the keys of a fault that they use:
+A fault hits a request and its reply. ``on`` selects the requests that count: any, read, write, or those with a certain first register
+(``write 64``); ``at`` is the number of the request among them, from 0. The kinds, and the keys of a fault that they use:
 
 ==================  ========================================================================================================
 drop_request        the device never sees the request

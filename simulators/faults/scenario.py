@@ -6,7 +6,7 @@
     seed = 7
 
     [[fault]]
-    kind = "delay_reply"     # what: a kind of the player
+    kind = "delay_reply"     # a kind that the player supports
     at = 2                   # first event of its sort that it hits, counted from 0 (requests, replies, frames, connections)
     times = 1                # how many in a row; 0: all from there on
     seconds = 0.3            # for kinds that wait

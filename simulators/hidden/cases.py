@@ -1,6 +1,7 @@
 """One sealed case: effects sized by their visibility, runs with readings, and the truth by which an answer is judged.
 
-Rivals of a hidden effect are those that are indistinguishable from it: they are found by first-order textbook traces of every named effect.
+The trace of an effect is its part of the readings. Rivals of a hidden effect are named effects that the readings cannot distinguish from
+it; they are found from the textbook traces of all named effects, to first order.
 """
 
 from collections.abc import Callable, Iterator
@@ -393,7 +394,7 @@ def _fact(
 
 
 def _separated(e: Hidden, setting: Setting, perfect: PerfectMachine, aliases: list[str]) -> dict[str, list[str]]:
-    """Return the further measurements that would separate each alias from the effect: those of plan full if they suffice, else `BEYOND`."""
+    """Return the measurements that would separate each alias from the effect: those of plan ``full`` if they suffice, else `BEYOND`."""
     if not aliases:
         return {}
     still: list[str] = aliases

@@ -82,7 +82,7 @@ class Live:
         self._carriage_mm: float | None = None
 
     def displacement(self, times_s: F, driven_mm: F) -> F:
-        """Return the displacement of the tool by the effect, (n, 3) mm, at drive positions (n, 3) mm, later than those of the last call."""
+        """Return the tool's displacement by the effect, (n, 3) mm, at drive positions (n, 3) mm and times after those of the last call."""
         if self.effect.name not in MOVES:
             return np.zeros(driven_mm.shape)
         track = self._track(times_s, driven_mm)

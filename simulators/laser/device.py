@@ -75,7 +75,7 @@ class LaserDevice:
         self._compensating = False
         self._zero_s = 0.0
         self.too_much: Callable[[float, float, float], float] | None = None
-        """Hidden effect: error of a reading (mm) from the instant (s), the time since the zero (s), and the path (mm)."""
+        """Hidden effect: maps the instant (s), the time since the zero (s) and the path (mm) to the error of a reading (mm)."""
         self._pending: tuple[int, float, F] | None = None
         self._output = Output(0, 0.0, 0.0, 0, 0b10001, air.at(0.0))
 

@@ -1,7 +1,7 @@
 """Seeded random draw of all parameters that are fixed for one machine and one set of instruments.
 
 Error motions are smooth random functions of one axis position: cosines of incommensurable wavelengths plus a few Gaussian bumps, neither
-polynomials nor splines, so that no identification whose basis is one of those can be exactly right.
+polynomials nor splines, so that no identification by polynomials or splines can be exactly right.
 """
 
 from dataclasses import dataclass

@@ -65,7 +65,7 @@ class Machine:
         return point
 
     def turned(self, axes_mm: F) -> F:
-        """Return the rotation of the tool against the workpiece at axis positions (n, 3), to first order the carriages' sum, (n, 3) rad."""
+        """Return the tool's rotation against the workpiece, (n, 3) rad, at axis positions (n, 3): the carriages' sum to first order."""
         total: F = np.sum([self.motions(axis, axes_mm[:, axis])[1] for axis in range(3)], axis=0)
         return total
 
