@@ -76,7 +76,7 @@ class Banks:
             raise RuntimeError("the control's network does not take values: is volumetric.hal the one of this bridge?")
 
     def write(self, bank: int, offset: int, words: list[int]) -> bool:
-        """Write words into the bank that does not act; for the other bank do nothing and return False."""
+        """Write words into a bank; if that bank is the acting one or the words do not fit, do nothing and return False."""
         if bank == self.active or not 0 <= offset <= image.BANK_WORDS - len(words):
             return False
         self._unstage(bank)

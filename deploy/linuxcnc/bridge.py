@@ -1,8 +1,8 @@
 #!/usr/bin/python3
 """Put the register map of docs/protocols/cnc.md in front of a running LinuxCNC.
 
-It runs with the control's own Python, which has the modules ``linuxcnc`` and ``hal``, needs nothing else, and ends with the control.
-``bridge.py --prepare RUNDIR``, run before the control starts, makes sure that there are tables for it to read.
+The bridge runs in the control's own Python, which has the modules ``linuxcnc`` and ``hal``. It needs no others, and ends with the control.
+Run ``bridge.py --prepare RUNDIR`` before the control starts: this makes sure that the control finds tables to read.
 """
 
 from __future__ import annotations

@@ -158,7 +158,7 @@ class Control:
         self._sent = self._command.serial
 
     def hold(self, *, on: bool) -> None:
-        """Set or release feed hold, whatever moves."""
+        """Set or release feed hold for any motion."""
         hal.set_p("abbe-feed.in1", str(int(on)))
 
     def path_output(self, *, on: bool) -> None:
@@ -184,7 +184,7 @@ class Control:
         return int(self._get("abbe-switch.in0")) == bank
 
     def seen(self) -> bool:
-        """Whether another bridge has already run since the control's start; leaves a mark for the next one."""
+        """Whether another bridge has already run since the control's start. The call leaves a mark for the next bridge."""
         before = bool(self._get("abbe-seen.in0"))
         hal.set_p("abbe-seen.in0", "1")
         return before

@@ -28,7 +28,7 @@ def reference(status, command) -> None:
 
 
 def _until(status, true, ask=None) -> None:
-    """Wait; a request is repeated now and then, because the control drops one that comes before it is ready for it."""
+    """Wait until ``true()``; repeat the request ``ask`` now and then, because the control drops requests that come before it is ready."""
     for turn in range(PATIENCE_S * 100):
         status.poll()
         if true():

@@ -1,7 +1,7 @@
-"""One-axis tables as files that the control reads at its start (COMP_FILE), in sets that one rename exchanges.
+"""One-axis tables as files that the control reads at its start (COMP_FILE), in sets; a single rename exchanges a whole set.
 
 In the run folder ``tables`` is a link to the set that the next start reads. A set is a folder with ``image.bin`` and the three files made
-of it. It is complete and on the disk before the link points to it, so the control never finds an incomplete set.
+from it. A set is complete and on the disk before the link points to it, so the control never finds an incomplete set.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class TableSets:
         return self._image(self._link.resolve())
 
     def acting(self, *, fresh_start: bool) -> list[int]:
-        """Image of the set that the running control has read; ``fresh_start``: it has just started and read the present set.
+        """Image of the set that the running control has read; ``fresh_start``: the control has just started and read the present set.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Compensation images (docs/protocols/cnc.md, "Banks") -> what this control can do with them: network curves and one-axis files.
+"""Convert compensation images (docs/protocols/cnc.md, "Banks") to the forms that this control supports: network curves and one-axis files.
 
 Nothing is approximated behind the host's back: an image that the control cannot reproduce is refused when it is sealed.
 """
@@ -138,7 +138,7 @@ def _one_axis(table: _Table, ends: dict[str, tuple[float, float]]) -> Plan:
 
 
 def _vertices(places_mm: list[float], values: tuple[int, ...]) -> Vertices:
-    """The corners of a polyline with equal pitch: points on the straight line between their neighbours say nothing."""
+    """Return the corners of a polyline with equal pitch; leave out points on the straight line between their neighbours."""
     last = len(values) - 1
     corner = [n for n in range(len(values)) if n in (0, last) or values[n] - values[n - 1] != values[n + 1] - values[n]]
     return tuple((places_mm[n], values[n] * _LSB_MM) for n in corner)
@@ -166,8 +166,8 @@ def _grid(table: _Table, ends: dict[str, tuple[float, float]]) -> Plan:
 class _Parts:
     """Least-squares parts of one output of a grid: a mean, a function of each axis, and functions times a lever arm.
 
-    Lever arms count from the middle of the grid: then all parts are orthogonal and each is a projection, but for the product of two
-    coordinates, which two of them could hold; the second gives it up.
+    Lever arms are measured from the middle of the grid, which makes the parts orthogonal, so that each is a projection. Only the product of
+    two coordinates fits two parts; the first part keeps it.
     """
 
     def __init__(self, table: _Table, output: str) -> None:
@@ -188,7 +188,7 @@ class _Parts:
             self.levers[a, k] = self._without_product(a, k, [v - level for v in raw])
 
     def _project(self, a: str, k: str = "") -> list[float]:
-        """Mean over the other axes at each place of ``a``; with ``k`` the slope along its lever arm."""
+        """Return the mean over the other axes at each position of axis ``a`` or, with ``k``, the slope along the lever arm ``k``."""
         n, m = AXES.index(a), AXES.index(k) if k else 0
         total = [0.0] * self.table.counts[n]
         for node, value in self.nodes.items():
@@ -206,7 +206,7 @@ class _Parts:
         return [v - slope * u for v, u in zip(values, arm, strict=True)]
 
     def shift(self, a: str) -> list[float]:
-        """The function of one axis, in units, when lever arms count from zero of the machine."""
+        """Return the function of one axis, in LSB, for lever arms that are measured from the machine's zero."""
         total = [v + (self.mean if a == AXES[0] else 0.0) for v in self.base[a]]
         for (b, k), values in self.levers.items():
             if b == a:
@@ -214,11 +214,11 @@ class _Parts:
         return total
 
     def vertices(self, a: str, values: list[float]) -> Vertices:
-        """Values at the places of an axis, in mm (or mm per mm)."""
+        """Convert values at the grid positions of an axis from LSB to mm (or mm per mm)."""
         return tuple((p, v * _LSB_MM) for p, v in zip(self.table.places_mm(AXES.index(a)), values, strict=True))
 
     def worst(self) -> float:
-        """Largest difference at a node, in units."""
+        """Return the largest difference between the grid and the sum of the parts at a node, LSB."""
         largest = 0.0
         for node, value in self.nodes.items():
             at = dict(zip(AXES, node, strict=True))
