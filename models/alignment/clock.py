@@ -36,7 +36,7 @@ SIDE = 4
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Table of the error of a lower envelope of delays with a power-law distribution, in units of the 24th smallest delay.
+    """Error of the line under a cloud of delays with a power-law distribution, in units of the 24th smallest delay, as a table.
 
     ``shape``: estimated exponents, one per column of the table. ``bias``: how much too high the line lies in its middle. ``half``: half the
     width of the 95.45 % interval of the error in the middle. ``tilt``: half the width of this interval for the rise of the line from end to

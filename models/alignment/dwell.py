@@ -138,7 +138,7 @@ def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, m
 def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], about: tuple[F1, F1, F1]) -> tuple[int, int, int] | None:
     """Find an equally good assignment that differs from ``pairs``; return a standstill and the two places to which it may belong, or None.
 
-    Both places are the same if ``pairs`` leaves this standstill out and gives its place another one.
+    Both places are the same if ``pairs`` leaves this standstill out and assigns another standstill to its place.
     """
     targets, levels, reach = about
     taken = {s: k for k, s in pairs.items()}
@@ -241,7 +241,7 @@ def sides(t_s: F1, y: F1, found: tuple[Standstill, ...], smallest: float) -> F1:
 
 
 TOLERANCE = 0.3
-"""If the reading changes between two standstills without motion, the change is a jump, up to this share of the smallest planned move."""
+"""A change of the reading between two standstills without motion is a jump if it is below this share of the smallest planned move."""
 LONG, SHORT = 1.8, 0.4
 """A standstill is reported if it is more than LONG times or less than SHORT times as long as planned."""
 JUMP_SAMPLES = 2

@@ -202,7 +202,7 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 def _field(solution: JointSolution) -> tuple[list[int], F2]:
     """Return the indices of the q smooth coefficients, and the deviation over the volume per unit of each and of the six rigid motions.
 
-    The deviation has shape (3 x points, q + 6). Terms above `SMOOTH_ORDER` are left out, because no angle has the same effect as they.
+    The deviation has shape (3 x points, q + 6). Terms above `SMOOTH_ORDER` are left out, because no angle has the same effect.
     """
     smooth = [i for i, t in enumerate(solution.terms) if t.order <= SMOOTH_ORDER]
     terms = tuple(solution.terms[i] for i in smooth)

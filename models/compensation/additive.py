@@ -51,7 +51,7 @@ def additive_design(
 def diagonal_order(terms: tuple[Term, ...]) -> int:
     """Return the highest Legendre order of a deviation along the diagonals without its main effects.
 
-    Only angles leave something, because the deviation by a translational motion is a function of one axis. Along a diagonal, an angle
+    Only angles remain, because the deviation by a translational motion is a function of one axis. Along a diagonal, an angle
     times a travel is one order higher than the angle.
     """
     return max((t.order for t in terms if t.component > 2), default=0) + 1

@@ -1,4 +1,4 @@
-"""Errors of distances between two points of a part: the machine's errors as its user sees them, which a rigid motion does not change.
+"""Errors of distances between two points of a part. These are the machine's errors as its user sees them; no rigid motion changes them.
 
 Comparing these errors without and with a compensation table judges the table.
 """

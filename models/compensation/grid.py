@@ -258,7 +258,8 @@ def compensable_nodes(
     """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
     The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes where the part that no
-    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`). ``scales``: left out of both.
+    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`). ``scales``: scale errors that count
+    neither in the uncertainty nor in this part.
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

@@ -45,7 +45,7 @@ TRUE_TO_FORM_OF = {
 }
 """`TRUE_TO_FORM` of single effects that differ from their family."""
 CARRYING = ("modulated", "sensor")
-"""Forms (by prefix) that carry part of an effect's size, thermal effects aside."""
+"""Prefixes of the forms that carry part of an effect's size; those of thermal effects are not listed."""
 OFFSET = "offset"
 """Prefix of forms whose first column is a constant: the start value of a sensor is not part of the effect."""
 TIME_TRUE_TO_FORM = 0.3
@@ -70,8 +70,8 @@ SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed
 (3 % of its evidence), the deviation resembles another effect of the group. In 345 cases (150 others for lags) ten false names had 0.2 to
 2.9 % of the evidence of the strong effect; one true name had 9 %."""
 REST_SHARE = 0.1
-"""If part of the gap has no explanation, a name with less than this share of its evidence is a residue of it: an unknown effect always
-resembles some name a little. In cases whose effects were all found, no such part remains."""
+"""If part of the gap has no explanation, a name with less than this share of that part's evidence is a residue of it: an unknown effect
+always resembles some name a little. In cases whose effects were all found, no such part remains."""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name is a residue of another if its evidence is below the first share of the other's and their signals overlap by more than the
 second."""

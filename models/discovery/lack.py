@@ -51,8 +51,8 @@ class Floor:
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
     """Return the noise of each instrument, from repeats or from differences of neighbouring readings, the smaller of both.
 
-    Residuals also contain model errors; they count only if these two are not clearly smaller. Neither of the two contains an effect, so the
-    closed share of a gap does not depend on the effects found.
+    Residuals also contain model errors, so they count only if repeats and differences are not clearly smaller. Neither repeats nor
+    differences contain an effect, so the closed share of a gap does not depend on the effects found.
     """
     left = problem.projection.residual * problem.sd_mm()
     near = fine(left, problem.lengths, problem.kinds, problem.use, problem.projection.leverage)

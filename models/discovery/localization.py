@@ -257,8 +257,9 @@ def _weighted_p(weight: F1, square: F1) -> float:
 def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_Group]:
     """Test each run for correlation of neighbouring residuals: Ljung-Box over the first ten lags.
 
-    In a short run one spectral line of white noise, strong by chance, correlates all lags at once: chi-square over ten independent lags
-    (1e-7 where 4000 draws of 74 readings give it once) is no bound there, so p is at least that of such a line at one of n/2 frequencies.
+    In a short run, one spectral line of white noise that is strong by chance correlates all lags at once. Chi-square over ten independent
+    lags then gives too small a p: 1e-7 for a value that one of 4000 draws of 74 readings reaches. So p is at least that of such a line at
+    one of n/2 frequencies.
     """
     for p, r in zip(paths, whitened, strict=True):
         if p.n < 4 * LAGS:

@@ -1,8 +1,8 @@
-"""Readings under the wrong label: whether two runs fit when their readings are exchanged, or one when its readings are reversed.
+"""Find readings under the wrong label: two runs that fit if their readings are exchanged, or one that fits if its readings are reversed.
 
-Also tools whose stated vector has the wrong sign in one component. This comes before any effect is blamed: exchanged readings resemble
-hysteresis, lags and lost motion of several axes. A wrong sign that all runs share, of the tool or of a pivot, changes no reading: the error
-motions along the axes absorb its effect on the rotations.
+Also find tools whose stated vector has the wrong sign in one component. Both precede the search for effects, because exchanged readings
+resemble hysteresis, lags and lost motion of several axes. A wrong sign of the tool or of a pivot that all runs share changes no reading:
+the error motions along the axes absorb its effect on the rotations.
 """
 
 from __future__ import annotations

@@ -13,8 +13,8 @@ from abbe.models.effects.path import Path
 
 FEWEST_RUNS = 8
 FOLLOWS, STRAYS = 0.99, 0.95
-"""Correlations with the warm-up: another column follows it from the first on, the part's own does not below the second. In the practice set
-every own column reaches 0.999."""
+"""Correlations with the warm-up: another column follows the warm-up if it reaches the first; the part's own column does not follow it if it
+stays below the second. In the practice set every own column reaches 0.999."""
 
 
 def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values) -> str:

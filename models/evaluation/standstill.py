@@ -98,7 +98,7 @@ def rms(values: F1) -> float:
 
 
 def _static(others: Sequence[StandstillRun], run: StandstillRun) -> F1:
-    """Prediction of a run by the changes of temperature of the others, at once."""
+    """Predict a run by a model without lag, fitted to the temperature changes of the other runs (least squares)."""
     changes = np.concatenate([r.temperatures_c - r.temperatures_c[0] for r in others])
     slopes = np.linalg.lstsq(changes, np.concatenate([r.displacement_mm for r in others]), rcond=None)[0]
     return np.asarray((run.temperatures_c - run.temperatures_c[0]) @ slopes)

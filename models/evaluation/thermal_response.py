@@ -67,7 +67,7 @@ class StandstillRun:
         return np.unique(np.floor((self.t_s - self.t_s[0]) / BLOCK_S), return_inverse=True)[1]
 
     def features(self, time_constant_s: float) -> F2:
-        """Temperatures from 20 degrees C, and behind their lag, K, shape (n, 2 sensors)."""
+        """Temperatures minus 20 degrees C, and the same after the lag, K, shape (n, 2 sensors)."""
         if time_constant_s not in self._features:
             now = self.temperatures_c - REFERENCE_C
             lagged = now.copy()

@@ -44,7 +44,7 @@ SMOOTH_ORDER = 12
 ROUGH_ORDER = 36
 """Highest Legendre order of a translational error motion with its rough part: details of a twentieth of the stroke."""
 ROUGH_ANGLE_ORDER = 24
-"""The same of a rotational error motion."""
+"""Highest Legendre order of a rotational error motion with its rough part."""
 
 
 @lru_cache(maxsize=1)

@@ -1,8 +1,8 @@
-"""Deviation by rule G at many points, with two ideas that keep the digits: a grid is a product of matrices, and blocks stay in the cache.
+"""Deviation by rule G at many points, fast and without loss of digits: a grid is a product of matrices, and blocks fit into the cache.
 
-Every error motion depends on the position of its own axis only. On a full grid rule G is therefore a sum of eight terms, each a number of X
-times a number of the Y-Z plane: the functions are evaluated on three lines, and the rest is one product of matrices, (nx, 8) by
-(8, 3 ny nz). Points in any other order are worked off in blocks. Both are shared between two threads
+Every error motion depends on the position of its own axis only. On a full grid rule G is therefore a sum of eight terms, each a value along
+X times a value in the Y-Z plane: the functions are evaluated on three lines, and the rest is one product of matrices, (nx, 8) by
+(8, 3 ny nz). Points in any other order are processed in blocks. Two threads share the work in both cases
 (docs/decisions/0047-a-map-is-numpy.md).
 """
 
@@ -25,11 +25,11 @@ BLOCK = 4096
 SHARED = 65_536
 """Points from which on blocks are shared among the cores; below, starting threads costs more than it saves."""
 CORES = 2
-"""Number of threads for many points: more wait for memory, and on one core a second thread costs little."""
+"""Number of threads for many points. More would only wait for memory; on a single core the second costs little."""
 LEAST = 512
 """Points from which on it is worth looking whether they are a grid."""
 TILE = (32, 1000)
-"""Rows and columns of one product: with 8 in between fewer than 2**18 multiplications, from which on OpenBLAS starts threads of its own."""
+"""Rows and columns of one product: times 8, fewer than the 2**18 multiplications from which on OpenBLAS starts threads of its own."""
 
 Motions = Callable[[F2], F3]
 Lines = tuple[F1, F1, F1]
@@ -168,7 +168,7 @@ def _own(machine: Machine, axis: int, line_mm: F1, motions: F2) -> F2:
 
 
 def _plane(mask: F3, lines: Lines, moved: list[F2], motions: tuple[F2, F2, F2]) -> NDArray[np.float64]:
-    """Return what stands beside 1, x, EX EY EZ and EA EB EC of X in the Y-Z plane, shape (8, ny, nz, 3)."""
+    """Return the factors of 1, x, EX EY EZ and EA EB EC of X as functions of the Y-Z plane, shape (8, ny, nz, 3)."""
     (_, y, z), unit = lines, np.eye(3)
     turned = [[mask[a, b] * np.cross(motions[a][:, 3:], unit[b]) for b in range(3)] for a in range(3)]
     out = np.zeros((8, y.size, z.size, 3))

@@ -1,4 +1,4 @@
-"""Uncertainty of a plane of the machine after an artefact of unknown form was probed there in several poses: the posterior bound.
+"""Posterior bound of the uncertainty in a plane of the machine in which an artefact of unknown form was probed in several poses.
 
 Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share unknowns, the form of the artefact. So all poses are
 evaluated together.

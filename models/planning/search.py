@@ -280,7 +280,7 @@ class Goal:
     wanted_mm : float
         Largest U = 2 u of the deviation vector in the inner volume.
     reached : bool
-        Whether the plan reaches it.
+        Whether the plan reaches ``wanted_mm``.
     minutes_needed : float or None
         Minutes after which it is reached; None: not within `LONGEST_MIN`.
     limit_mm : float

@@ -14,9 +14,9 @@ Unknowns: ``pose_<setup>_x/y/z`` (mm), ``turn_<setup>_a/b/c`` (rad, artefact axe
 the farthest feature: rotation or scale growing with r^2, bends; what clamping or springing back leaves in a workpiece),
 ``shear_<artefact>_stretch/square`` (mm there: of the artefact, or of the
 CMM), ``cmm_<artefact>`` (its scale), ``stylus_<source>`` (mm),
-``lobing_<direction>_x/y/z`` (mm, machine axes: touches that start in this direction against the usual one; along a wall: this direction),
+``lobing_<direction>_x/y/z`` (mm, machine axes: shift of touches that start in this direction; of a wall with this normal: pre-travel),
 ``clamp_<setup>_..``, ``warp_<setup>_..`` (mm at the farthest feature: bends in one pose), ``calibration_<artefact>_<from>_<to>`` (mm),
-``step_<setup>_x/y/z/a/b/c`` (mm, rad: it moved during the run), and fine structure of the machine (`Fine`).
+``step_<setup>_x/y/z/a/b/c`` (mm, rad: motion of the artefact during the run), and fine structure of the machine (`Fine`).
 
 Source: artefact-based self-calibration by reversal, Evans, Hocken and Estler, CIRP Annals 45/2 (1996) 617.
 """

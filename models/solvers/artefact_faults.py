@@ -22,11 +22,13 @@ Settle = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
 OTHER_PLACE_MM = 1.0
 """A feature found farther than this from its nominal place is taken for the feature that lies there, if one does."""
 NOISY, STRONG = 4.0, 25.0
-"""Poses are doubted if the scatter of their points is this many times the repeatability; least gain of log evidence that proves a fault."""
+"""`NOISY`: poses are doubted if their points scatter by this multiple of the repeatability. `STRONG`: least gain of log evidence that
+proves a fault.
+"""
 STEP_MM, STEP_RAD = 0.02, 1e-4
 """Prior size of a motion of the artefact during a run."""
 QUIETER, GROSS_SIGMA = 1.5, 50.0
-"""`QUIETER`: a run is parted if that divides the scatter of its points by this factor or more. `GROSS_SIGMA`: largest size, in standard
+"""`QUIETER`: a run is split if this divides the scatter of its points by this factor or more. `GROSS_SIGMA`: largest size, in standard
 deviations, with which one point counts in this scatter."""
 DOUBTED = 0.5
 """A point whose robust weight is below this is doubted."""
@@ -135,7 +137,7 @@ def _quarter_turn(
 
 
 def _disagreement(runs: tuple[RunData, ...]) -> float:
-    """Sum of squares by which the forms in the runs differ, each without its best-fit affine map; a machine adds its errors alike."""
+    """Sum of squares by which the forms in the runs differ, each without its best-fit affine map; all runs have the machine's errors."""
     seen: dict[tuple[str, int], list[float]] = {}
     for p, deviation in ((r.points, r.deviation_mm) for r in runs if r.points is not None and r.points.source != "length"):
         for k in np.unique(p.component):
@@ -172,7 +174,7 @@ def turned_run(run: RunData, quarter: int) -> RunData | None:
 
 
 def _step(problem: CampaignProblem, fit: CampaignFit) -> tuple[tuple[RunData, ...], str] | None:
-    """Part a run at the time after which the artefact lies elsewhere; None without strong evidence."""
+    """Split a run at the time after which the artefact lies elsewhere; None without strong evidence."""
     score, runs, best = Score.of(problem, fit), problem.runs, (STRONG, 0, 0.0)
     for i, run in enumerate(runs):
         if run.points is None or run.points.source == "length" or np.isfinite(run.points.step_s):
@@ -192,7 +194,7 @@ def _step(problem: CampaignProblem, fit: CampaignFit) -> tuple[tuple[RunData, ..
 def _moved_step(
     runs: tuple[RunData, ...], problem: CampaignProblem, fit: CampaignFit, label: str, settle: Settle
 ) -> tuple[tuple[RunData, ...], CampaignProblem, CampaignFit]:
-    """Move a step over the neighbours that the fit left out, if fewer are left out then: they lay on its other side."""
+    """Move a step over neighbouring points that the fit left out, if it then leaves out fewer points: these lay on the other side."""
     i = next(k for k, r in enumerate(runs) if r.label == label)
     run, weight = runs[i], problem.split(fit.weight)[i]
     assert run.points is not None

@@ -269,7 +269,7 @@ def estimate(sums: InformationSums, model: SizeModel, start: Components) -> Fitt
 
 
 def _inward(gradient: F1, info: F2, c: Components, model: SizeModel) -> F1:
-    """Scoring step of the numbers that may move; one at a bound that its gradient pushes against stays there."""
+    """Scoring step of the numbers that may move; a number at a bound stays there if its gradient pushes it against the bound."""
     now, (low, high) = np.concatenate([c.psi, c.eta]), _bounds(c, model)
     free = np.flatnonzero(~(((now <= low) & (gradient < 0)) | ((now >= high) & (gradient > 0))))
     step = np.zeros(now.size)
@@ -328,13 +328,13 @@ def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> t
 
 ROUGH_CAUTION = 0.2
 """Share of the widening by `cautious` that counts in U of a rough machine. Its rough parts take up what the shapes of the smooth prior do
-not follow; with all of it U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps all of it: it costs a map nothing."""
+not follow; with all of it U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps all of it at no cost."""
 
 
 def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> tuple[SizeModel, Components]:
     """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    It differs in two ways, none of which matters with many readings; ``share`` of the first counts.
+    The prior differs in two ways, neither of which matters with many readings. ``share``: share of the first that counts.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
       that the readings hardly separate, the most probable sizes are too small. Without information it is at most the documented one.

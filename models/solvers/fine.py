@@ -25,7 +25,7 @@ NUGGETS, NOISY = 3.0, 1.4
 """Positions get values of their own if the score for these exceeds its expectation by `NUGGETS` standard deviations, or if the scatter of
 probed points is `NOISY` times their repeatability."""
 SURE, ROUNDS = 0.8, 3
-"""Further periods are searched for, so many times in all, only after one of at least this probability."""
+"""After a period of at least the probability `SURE`, further ones are searched for, in at most `ROUNDS` searches."""
 
 
 @dataclass(frozen=True)
@@ -105,7 +105,7 @@ def _sensed(runs: tuple[RunData, ...]) -> list[tuple[RunData, F2]]:
 
 
 def _nuggets(runs: tuple[RunData, ...]) -> tuple[Fine, ...]:
-    """One unknown for every position of an axis at which it was sensed along itself or across."""
+    """One unknown for every position of an axis at which a row reads this axis' own direction."""
     out = []
     for axis in range(3):
         places = np.sort(np.concatenate([r.axes_mm[np.abs(way[:, axis]) > 0.1, axis] for r, way in _sensed(runs)]))
@@ -130,7 +130,7 @@ def _columns(runs: tuple[RunData, ...], fine: tuple[Fine, ...]) -> F2:
 def _waves(peaks: tuple[Peak, ...]) -> tuple[Fine, ...]:
     """Waves of probable periods, sized by their probability.
 
-    Two at the ends of the standard uncertainty stand for each, so that the solution can shift the period.
+    Two waves, at the ends of the standard uncertainty of a period, stand for each period, so that the solution can shift it.
     """
     out = []
     for p in peaks:

@@ -18,7 +18,7 @@ Published methods (Yang and Kim; Wang) take the set-ups as perfect. Here each se
   in the angles, so the angles themselves, with zero derivative at zero, cannot be the unknowns.
 - ``laser_scale``: relative error of the laser's wavelength, common to all laser runs of the campaign.
 - ``zero_<run>``, mm, and ``drift_<run>``, mm/s: error of a laser run's first record, which sets its zero; slow drift of the run.
-- those of an artefact: `abbe.models.solvers.artefact`.
+- unknowns of an artefact: see `abbe.models.solvers.artefact`.
 """
 
 from __future__ import annotations
@@ -304,7 +304,7 @@ def predict(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: Setu
 
 
 def run_jacobian(machine: Machine, terms: tuple[Term, ...], run: RunData, setup: SetupUnknowns, theta: F1) -> F2:
-    """Exact analytic derivative of `predict` at given unknowns, shape (n, terms + 3 + set-up); parameters as there."""
+    """Exact analytic derivative of `predict` at given unknowns, shape (n, terms + 3 + set-up); parameters as in `predict`."""
     return _of(machine, terms, run, setup, theta).jacobian()
 
 

@@ -26,13 +26,13 @@ RIGID6 = 0
 END, CORNER = 0.15, 0.3
 """Part of the measured range that is the end of a stroke; of all three ranges together, a corner."""
 FEWEST = 6
-"""A region with fewer readings is no region."""
+"""Least number of readings of a region."""
 
 
 def regions(runs: tuple[RunData, ...]) -> tuple[NDArray[np.intp], ...]:
     """Readings at each end of a measured range and in each corner of the measured box: row numbers over all runs.
 
-    The same rows are listed once; a region that holds more than half of the readings is none.
+    The same rows are listed once; regions that hold more than half of the readings are left out.
     """
     at = np.concatenate([r.axes_mm for r in runs])
     low, high = at.min(axis=0), at.max(axis=0)

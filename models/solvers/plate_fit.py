@@ -19,7 +19,7 @@ COVERAGE = 2.0
 WARM_K = 0.3
 """Standard uncertainty of the temperature of part and scales."""
 CLEAR = 1.5
-"""A quantity is said to be there from this multiple of its expanded uncertainty on."""
+"""A quantity is reported as present if it exceeds this multiple of its expanded uncertainty."""
 NAMES = ("EXX", "EYY", "C0Y", "swirl")
 
 

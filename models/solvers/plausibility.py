@@ -45,7 +45,7 @@ class Part:
 
     @cached_property
     def moment(self) -> F1:
-        """What the run says of the unknowns, shape (p,): transposed design times readings."""
+        """Moment of the unknowns by this run, shape (p,): transposed design times readings."""
         return np.asarray(self.a.T @ self.y)
 
 
@@ -293,7 +293,7 @@ def _shortened(run: RunData) -> RunData:
 
 
 def _readings(short: RunData) -> F1:
-    """Readings minus nominal ones; without deviations, what a wrong unit does not affect."""
+    """Readings of a shortened run minus those of a perfect machine."""
     return np.asarray(short.deviation_mm - nominal_reading(short))
 
 

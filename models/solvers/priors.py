@@ -263,7 +263,7 @@ class _Number(NamedTuple):
 
 
 def _classes(kinds: list[str]) -> list[_Number]:
-    """Size of every class; a set-up may be better than usual by any factor, because its unknowns are no shapes that could explode."""
+    """Size of every class. A set-up may be better than usual by any factor: its unknowns are not shapes, so a small size does no harm."""
     high = 2.0 * np.log(LARGEST_SIZE)
     low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else 2.0 * np.log(SMALLEST_SIZE) for k in kinds}
     bounds = {k: (2.0 * np.log(SIZE_FACTOR), low[k], high) for k in kinds}

@@ -46,7 +46,7 @@ class Period:
     u_period_mm: float
 
     def text(self) -> str:
-        """One sentence: what it is and what to do."""
+        """One sentence for people: the period and its remedy."""
         return (
             f"{self.motion}: {self.amplitude_mm * 1e3:.2f} ± {2 * self.u_amplitude_mm * 1e3:.2f} µm with a period of "
             f"{self.period_mm:.2f} ± {2 * self.u_period_mm:.2f} mm, as of a screw's lead; only a table with points every "
@@ -227,7 +227,7 @@ def _gain(rest: F1, cosine: F2, sine: F2) -> F1:
 def _weights(solution: JointSolution) -> list[F1]:
     """Weight of every reading, run by run.
 
-    Readings that the solution gave up because the period itself made them outliers count again.
+    Readings that the solution rejected only because the period made them outliers count again.
     """
     out, first = [], 0
     for run in solution.runs:

@@ -22,8 +22,8 @@ PERIODS_MM = (4.0, 60.0)
 """Range of the searched periods."""
 LEADS_MM = (5.0, 6.0, 8.0, 10.0, 12.0, 16.0, 20.0, 25.0, 32.0, 40.0)
 USUAL, SMOOTH, ALL_AXES, TWO = 0.7, 0.3, 0.7, 0.3
-"""Prior probabilities that a period is the lead of a usual screw, that there is none, and that all axes have the same one. Of two periods
-each may be none, so that they count `TWO` times 1 - `SMOOTH` beside 1 - `TWO` of one; the posterior is normalised."""
+"""Prior probabilities: `USUAL` that a period is the lead of a usual screw, `SMOOTH` that there is no period, `ALL_AXES` that all axes have
+the same one. One period has the weight (1 - `TWO`) (1 - `SMOOTH`), two have `TWO` (1 - `SMOOTH`)^2; the posterior is normalised."""
 LEAST = 0.05
 """Least probability of a period that enters the model."""
 COARSE, FINE, NEAR = 0.3, 0.06, 2
@@ -32,7 +32,9 @@ width in fine steps."""
 APART = 4
 """Coarse steps between the two periods of a pair, at least: closer ones are one period with a changing amplitude."""
 LIKELY, MOST = 60, 700
-"""Number of pairs whose neighbourhood is searched finely; of coarse frequencies that form pairs: on longer ways, those best alone."""
+"""`LIKELY`: number of pairs whose neighbourhood is searched finely. `MOST`: largest number of coarse frequencies from which pairs are
+formed, those that are best alone.
+"""
 SCATTER_MM = tuple(float(v) for v in np.geomspace(3e-5, 4e-3, 9))
 """Standard deviations of the scatter from position to position that are tried, equally probable."""
 
@@ -51,7 +53,7 @@ class Peak:
 
 @dataclass(frozen=True)
 class Displacements:
-    """What the readings say of the displacements d at positions of the axes: log likelihood ``h @ d - d @ information @ d / 2``, mm.
+    """Log likelihood of the displacements d at positions of the axes by the readings: ``h @ d - d @ information @ d / 2``, mm.
 
     ``axis``, ``at_mm``: axis and position of every displacement, shape (n,).
     """
@@ -63,7 +65,7 @@ class Displacements:
 
     @classmethod
     def of(cls, problem: CampaignProblem, fit: CampaignFit, places: Sequence[Fine]) -> Displacements:
-        """Of a solution that has these places as unknowns: their posterior without their prior."""
+        """Take the displacements from a solution that has these places as unknowns: their posterior without their prior."""
         at = np.array([problem.names.index(p.name) for p in places])
         kind = problem.readings.kind
         weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]

@@ -100,7 +100,7 @@ def _tables(blocks: list[list[F3]], strip: slice) -> dict[tuple[int, int], F4]:
 
 
 def _tables_of_x(blocks: list[list[F3]], i: int, strip: slice) -> dict[tuple[int, int], F4]:
-    """Return the same of the blocks that depend on X, at one position of X."""
+    """Return the covariances, as `_tables` does, with the blocks that depend on X, at one position of X."""
     x = [block[i : i + 1] for block in blocks[0]]
     out = {(0, 0): _own(x)[None], (0, 1): np.swapaxes(_pair(x, [block[strip] for block in blocks[1]]), 0, 1), (0, 2): _pair(x, blocks[2])}
     return out | {(0, 3): _pair(x, blocks[3])} if len(blocks) > 3 else out

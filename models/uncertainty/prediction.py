@@ -237,7 +237,7 @@ def _one_by_one(sources: ErrorSources, points: F2, tool_mm: F1 | None, frame: Ri
 
 
 def _on_grid(sources: ErrorSources, points: F2, lines: Lines, tool_mm: F1 | None, frame: RigidFree | None) -> tuple[F2, F3, F3]:
-    """The same of a full grid, whose covariances are tables of its lines (`abbe.models.uncertainty.on_grid`)."""
+    """Return deviation, covariance and variance by source on a full grid, from tables of its lines (`abbe.models.uncertainty.on_grid`)."""
     machine, terms, coefficients = with_tool(sources.solution.machine, tool_mm), sources.terms, sources.coefficients
     deviation = field_mm(machine, lambda at: term_motions(terms, coefficients, at, machine.stroke_mm), points)
     if frame is not None:

@@ -25,7 +25,7 @@ UM = 1e-3
 """Columns of the signals are in mm per micrometre of strength."""
 SMOOTH_ORDERS = (2, 3, 4, 5, 6)
 ODD_ORDERS = (1, 2, 3)
-"""Without order 0: a jump at every reversal has a name (lost motion), which a structure with this order would replace."""
+"""Order 0 is left out: a jump at every reversal has a name (lost motion), which a structure with order 0 would replace."""
 ARM_MM = 300.0
 """Rotations of a slip are stated as displacements at this distance, so that all its columns are in micrometres."""
 PREFIX = "unnamed_"

@@ -37,17 +37,17 @@ OFF, PLACE_Z = 3.5, 4.0
 """`OFF`: a reading this many standard deviations off is an outlier. `PLACE_Z`: if the readings near outliers deviate by this many, the
 position is the cause and not a lost beam (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
 LEAST_INSIDE, LEAST_RUNS, IN_RUNS, ROUGHER = 12, 3, 0.75, 1.2
-"""What a rough place needs: readings that a run must have inside and outside of it, such runs, the share of them that must show it, and the
+"""Least values for a rough place: readings of a run inside and outside of it, number of such runs, share of them that show the place, and
 ratio of the variances."""
 CLIPPED, MOSTLY = 4.0, 0.7
 """At a rough place, larger deviations count as `CLIPPED` standard deviations. Wrong readings belong to the place if at least the share
 `MOSTLY` of them lies there."""
 UNNAMED_PRICE = 3.0
 BURST_PRICE = 7.0
-"""Further price of a burst: noise has memory, so a few of its readings in a row are large more often than the price of a name says. In 146
-campaigns without one, one gained 11.3 beside the log of the trials; the weakest true one of the practice set gained 23."""
+"""Further price of a burst: noise has memory, so a few of its readings in a row are large more often than the price of a name says. The
+largest gain beyond the log of the trials was 11.3 in 146 campaigns without a burst; the weakest true burst of the practice set had 23."""
 LEAST_OFF = 10
-"""Minimum number of wrong readings of a ball-bar that get a name; fewer are left out of the fit without a word."""
+"""Minimum number of wrong readings of a ball-bar that get a name; fewer are left out of the fit without a message."""
 LEAST_LASER = 60
 """Minimum number of laser readings for estimating a rate of 1 in 100."""
 DRIVES = ("stick_slip", "vibration")
@@ -292,7 +292,7 @@ def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
 
 
 def _bar_scatter(paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
-    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); not the latter where most are at the former."""
+    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); only the place if it holds most of these."""
     found = _rough_places(paths, tuple(np.clip(r, -CLIPPED, CLIPPED) for r in rest), sigma_mm)
     if found and found[0].evidence > 0.0:
         there = np.concatenate(rough_place(paths, found[0].key))

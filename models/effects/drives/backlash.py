@@ -103,4 +103,4 @@ BEGUN = replace(
     variant_of="backlash",
     beside=("backlash", "backlash_position_dependent", "servo_mismatch", "reversal_spike"),
 )
-"""A lost motion that was not there from the beginning; one that grows in a step is this one beside `EFFECT`."""
+"""Lost motion that begins during the campaign. A lost motion that grows by a step is found as `EFFECT` and `BEGUN` together."""

@@ -56,7 +56,7 @@ def _rounded(path: Path, key: str, values: Values) -> F2:
 
 
 def _at_once(path: Path, key: str, values: Values) -> F2:
-    """Return the gain of the spike during its rise if it rises at once."""
+    """Return the additional height during the rise of a spike that rises at once."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     return _read(path, key, _height(path, key, values) * np.maximum(1.0 - x / RISE, 0.0))
 

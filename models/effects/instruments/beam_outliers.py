@@ -48,4 +48,4 @@ BAR = replace(
     blind=("laser_diagonal", "laser_linear"),
     separated_by={},
 )
-"""The same of a ball-bar: dirt in a cup, a bumped table, a broken link."""
+"""Outliers of a ball-bar: dirt in a cup, a bumped table, a broken link."""

@@ -136,7 +136,7 @@ NAMED: dict[str, Callable[[F2], F2]] = {
 
 
 def _free(poses: list[_Pose], reach: float, *, scale: bool) -> F2:
-    """Readings of form, pose and scale of the artefact, shape (2 n, unknowns)."""
+    """Readings per unit of the artefact's form, pose and scale, shape (2 n, unknowns)."""
     count = max(int(p.feature.max()) for p in poses) + 1
     blocks = []
     for i, p in enumerate(poses):
