@@ -146,7 +146,7 @@ def can_append(path: Path) -> None:
 
 
 def append_line(path: Path, text: str) -> None:
-    """Append a line; on return it is on disk. A torn line before it (power cut) stays a line of its own."""
+    """Append a line durably. A line before it that a power cut left incomplete stays a line of its own."""
     with suppress(FileExistsError):
         os.close(private_file(path))
     file = os.open(path, os.O_RDWR | os.O_APPEND)
@@ -312,7 +312,8 @@ def sqlite_base(database: Path) -> str:
 
 
 def _sqlite_files_base(store: Store | None, database: Path) -> str:
-    """Return `sqlite_base`; or an earlier version's path in a shared folder, if the key there sealed this database's last record."""
+    """Return the path of `sqlite_base`, or an earlier version's path in a shared folder if the key there sealed this database's last
+    record."""
     base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
     if store is None or not folder or files_of(base)[0].exists():
         return base
@@ -387,7 +388,7 @@ def files_base(store: Store | None, url: str) -> str | None:
 
 
 def _anchor(line: str) -> Anchor | None:
-    """Parse a kept head; None for a torn line (power cut). An attacker who tears lines could as well remove them."""
+    """Parse a line of the heads file; None for a line cut short by a power cut. Skipping it helps no attacker, who could also remove it."""
     parts = line.split(" ")
     if len(parts) == 3 and parts[0].isdigit() and [len(part) for part in parts[1:]] == [64, 64] and len(parts[0]) < 18:
         return Anchor(int(parts[0]), parts[1], parts[2])
