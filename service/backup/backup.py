@@ -88,7 +88,7 @@ class BackupList:
 
     @property
     def new_bytes(self) -> int:
-        """How much of it no earlier backup holds."""
+        """Size of the parts that no earlier backup holds."""
         return self.bytes - (0 if self.pieces is None else self.pieces.bytes - self.pieces.new_bytes)
 
 
@@ -115,7 +115,7 @@ def digest_of(path: Path) -> str:
 
 
 def file_list(folder: Path) -> dict[str, ListedFile | None]:
-    """Every file below a folder except the list and the pieces, by relative path; None: no plain file. Raises OSError."""
+    """Return every file below a folder except the list and the pieces, by relative path; None for what is no plain file. Raises OSError."""
     found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
         if path.parent == folder / PIECES:
@@ -229,8 +229,8 @@ def back_up(
     with_key : bool
         Include the audit's key. Without it, a holder of the backup cannot forge an audit, and `restore` asks for the key.
     share : bool
-        Write the database in pieces, and link those that the latest such backup beside ``target`` has. The database is first copied beside
-        itself, so that ``target``'s disk gets only what is new.
+        Write the database in pieces, and link pieces that the latest shared backup beside ``target`` already has. The database is first
+        copied beside itself, so that ``target``'s disk gets only what is new.
 
     Returns
     -------
@@ -292,7 +292,7 @@ def _room_beside(database: Path) -> Path:
 
 
 def _fill(part: Path, database: Path, copy: Path, source: BackupSource, utcnow: Callable[[], datetime], *, with_key: bool) -> BackupList:
-    """Fill the folder of a backup; ``copy``: of the database, in this folder or, to be cut into pieces, outside."""
+    """Fill the folder of a backup. ``copy``: the copied database, in this folder or, if it is to be cut into pieces, outside."""
     made = utcnow().isoformat(timespec="seconds")
     segments = _segments(part / CAPTURE, source)
     copy_online(database, copy)
@@ -355,7 +355,8 @@ def _segments(folder: Path, source: BackupSource) -> int:
 
 
 def _audit(part: Path, copy: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
-    """Copy the audit's files: heads (a sealed digest per record) after the database, so that none is missing, but none of later records."""
+    """Copy the audit's files. The heads are copied after the database, so that every copied record has its head; later heads are left
+    out."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():

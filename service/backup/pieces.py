@@ -22,7 +22,7 @@ PIECE_BYTES = 256 << 10
 
 @dataclass(frozen=True, slots=True)
 class ListedPieces:
-    """The database of a backup: its size, how much of it no earlier backup had, and the names of its pieces in order."""
+    """The database of a backup: its size, the size of the pieces that no earlier backup had, and the names of all its pieces in order."""
 
     bytes: int
     new_bytes: int
