@@ -110,15 +110,16 @@ def _named(others: list[str]) -> str:
 
 
 OTHER_FEED = 0.3
-"""Relative difference between the stated feed of a ball-bar run and the median feed of its positions and times; beyond it the column is
-wrong."""
+"""Largest relative difference between the stated feed of a ball-bar run and the median feed from its positions and times. Beyond it the
+column is wrong."""
 AGREE, ALIKE = 0.65, 4
-"""If direction and sense of rotation agree in this share of the runs of one kind, and in this many runs, the column of the others is
+"""Smallest share and number of runs of one kind that must agree in direction and sense of rotation; then the column of the other runs is
 wrong."""
 
 
 def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flag ball-bar runs whose columns feed_mm_min or direction contradict their positions and times, which the search uses instead."""
+    """Flag ball-bar runs whose columns feed_mm_min or direction contradict their positions and times; the search uses positions and
+    times."""
     out = []
     senses: dict[tuple[str, int], dict[str, float]] = {}
     for run in runs:
@@ -221,7 +222,7 @@ HALF = 0.5
 FEWEST_BAR = 20
 PER_TURN = 8
 OTHER_RATIO = 8.0
-"""A run whose misfit exceeds this multiple of the expected one, and `OTHER_MM`, is from another machine; a smaller misfit is a flag."""
+"""A run is from another machine if its misfit exceeds `OTHER_MM` and this multiple of the expected misfit; a smaller misfit is a flag."""
 OTHER_MM = 4e-3
 
 _READINGS = {

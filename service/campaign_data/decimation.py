@@ -30,10 +30,7 @@ def lines_of(made: FoundThinning) -> tuple[str, ...]:
 
 
 def _unobservable(*, each: int, means: bool, interval_s: float, turning: int) -> list[str]:
-    """Return limits of the decimated runs, one sentence each.
-
-    ``each``: readings per value; ``interval_s``: time between values; ``turning``: number of values in whose readings an axis reverses.
-    """
+    """Describe what the decimated runs cannot show, one sentence each."""
     highest_hz = 0.5 / interval_s  # Nyquist
     if means:
         # A spike as long as one interval usually spans two values; one as long as two intervals fills a value wherever it begins.
@@ -132,7 +129,7 @@ def _measured_bar(run: Run) -> bool:
 def _means(run: Run, block: int) -> Run:
     """Average each block to one value at its middle reading: the mean deviation from the nominal readings, plus the nominal reading there.
 
-    Without the nominal readings, the mean of points on a sphere would lie inside it. A block with a gap in time is dropped.
+    A plain mean of points on a sphere would lie inside the sphere. A block with a gap in time is dropped.
     """
     columns = run.columns
     count = len(columns) // block
