@@ -46,7 +46,7 @@ async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
 class BarBreaks:
     """Waits for the ball-bar's box if its link is lost during a test.
 
-    Only if the conditions of ``suspending`` contain ``ballbar``; otherwise the loss ends the measurement.
+    It waits only if the conditions of ``suspending`` contain ``ballbar``; otherwise the loss ends the measurement.
     """
 
     def __init__(self, session: Session, control: Control, suspending: Suspending) -> None:
@@ -92,7 +92,7 @@ def _in_vain(why: SetupDisturbed | Interlock | RunInterrupted) -> SetupDisturbed
 
 
 async def decline(_: str) -> bool:
-    """Answer no, for unattended campaigns: no person confirms an untouched set-up, so it is mounted anew."""
+    """Answer no in an unattended campaign: nobody can confirm that a set-up is untouched, so it is mounted anew."""
     return False
 
 
@@ -150,7 +150,7 @@ def items(plan: CampaignPlan) -> tuple[Item, ...]:
 
 
 def in_mounting(item: Item, mounting: int) -> Item:
-    """Restart a test from its beginning, in the n-th mounting of its set-up by an earlier test."""
+    """Restart a test from its beginning, after an earlier test made the n-th mounting of its set-up."""
     whole = anew(item.test, mounting)
     return replace(item, whole=whole, left=whole, mounting=mounting)
 

@@ -1,7 +1,7 @@
-"""Listens to a program that the operator starts: reads the laser continuously and turns its standstills into the readings of the recipe.
+"""Listens while the operator runs a program: reads the laser continuously and turns each standstill into a reading of the recipe.
 
 This is for controllers that Abbe does not move. Abbe writes nothing to the controller and uses only its clock, its position and the status
-"NC program running"; it also works without any connection to one. Sample times are those of the laser's own clock, converted to the
+"NC program running"; it also works without a connected controller. Sample times are those of the laser's own clock, converted to the
 controller's.
 """
 
@@ -123,7 +123,8 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
 
 
 async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: Report) -> None:
-    """Wait until the machine stands at the start of the test, where a person mounts the mirror and so confirms it without a control."""
+    """Wait until the machine stands at the start of the test; without known positions, the person who mounts the mirror there confirms
+    it."""
     before, reported = None, False
     if not math.isfinite(sum((await session.controller.status()).position_mm)):
         return
@@ -179,7 +180,8 @@ def _stream(heard: Heard) -> tuple[F1, F1]:
 
 
 def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
-    """Return the conversion from laser to controller time, by both clocks' fits to the host's, and the laser's lag, None if unknown."""
+    """Return a function from laser to controller time, made of both clocks' fits to the host clock, and the laser's lag, None if
+    unknown."""
     laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
     cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
 

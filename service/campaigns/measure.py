@@ -51,7 +51,8 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 
 @dataclass
 class ProgressReporter:
-    """Progress of a job in planned machine seconds; the dry run, then the wall time per machine second so far, gives the ETA.
+    """Progress of a job in planned machine seconds. The ETA follows first from the dry run, then from the wall time per machine second so
+    far.
 
     Time spent waiting for a person (``waited_s``) does not count.
     """
@@ -440,7 +441,8 @@ async def start_document(
 
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
-    """Return the number of readings at standstill in a whole run: those of its steps and those kept, of which the last is read again."""
+    """Return the number of standstill readings in a whole run: those of its steps and the kept ones, except a last one that is read
+    again."""
     count = sum(isinstance(step, ReadLaser | ReadBar | TouchFeature) for step in test.steps)
     kept = len(attempt.resume_trail.carried)
     return {"standstills": count + (kept if attempt.resume_trail.again else max(0, kept - 1))} if count else {}

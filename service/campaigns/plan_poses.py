@@ -35,7 +35,7 @@ ORDER = 4
 """Highest Legendre order of the planned map, as `pose_rank` counts its fields."""
 MOUNT_MIN = 8.0
 U_MM = 4e-4
-"""Repeatability of a found centre: assumed."""
+"""Assumed repeatability of a measured centre."""
 MARGIN_MM = 1.0
 NODES = 7
 COVERAGE = 2.0

@@ -163,7 +163,7 @@ ROOM_C = (10.0, 35.0)
 """A window of the air temperature beyond this is possible but rare."""
 LONG_VALID_YEARS = 10
 INSTRUMENTS = {BALLBAR: "ball-bar", LASER: "laser", "artefact": "artefact", "room": "room"}
-"""What has a certificate (`abbe.service.domain.run.Run.instrument`), in words."""
+"""Instruments that have a certificate (`abbe.service.domain.run.Run.instrument`), in words."""
 
 
 @dataclass(frozen=True, slots=True)
