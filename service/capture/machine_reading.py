@@ -1,4 +1,4 @@
-"""What the live screen shows of the machine: the latest answers of controller and laser, which the measurement asks for anyway."""
+"""The machine's state on the live screen: the latest answers of controller and laser to the queries of the measurement."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from abbe.service.domain.progress import MachineReading
 SHORTEST_S = 0.2
 """Shortest time between two positions from which a feed is computed, s."""
 OLD_S = 5.0
-"""An answer that is older, s, is not shown."""
+"""Answers older than this, s, are not shown."""
 MOST_PERCENT = 1000.0
-"""Largest override that is believed, %. An assumption: no standard names a largest one, and ten times the programmed feed is far above what
-an operator's switch reaches. More is a number that was misread."""
+"""Largest plausible override, %. Assumed, because no standard names one: no operator's switch reaches ten times the programmed feed, so
+a larger number was misread."""
 MM_PER_COUNT = 1e-7
 MM_MIN_PER_MM_US = 6e7
 
@@ -32,9 +32,9 @@ class LatestReading:
         self._stamps: dict[str, tuple[float, float]] = {}
 
     def __call__(self) -> MachineReading | None:
-        """The latest state; the feed is that of the path between two positions (chord).
+        """Return the latest state. Its feed is the distance between two positions (chord) over the time between them.
 
-        None before the controller's first answer, if the last one is older than `OLD_S`, and if a position is not finite.
+        None before the controller's first answer, if its last answer is older than `OLD_S`, or if a position is not finite.
         """
         status = latest_status(self._session.controller)
         if status is None or self._is_old(status.host_s) or not all(math.isfinite(x) for x in status.position_mm):
@@ -75,7 +75,7 @@ class LatestReading:
 
 
 def _percent(value: float) -> int | None:
-    """The override as a whole percentage; None if a control tells one that cannot be: it is not known then."""
+    """Return the override as a whole percentage; None if the control reports an impossible one."""
     return round(value) if math.isfinite(value) and 0.0 <= value <= MOST_PERCENT else None
 
 

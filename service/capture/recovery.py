@@ -1,6 +1,6 @@
 """Recovery after a crash: moves missing records from segments to the database, and marks their runs as interrupted.
 
-A segment that cannot be recovered stops neither the others nor the machine: it is renamed, and a message reports that.
+A segment that cannot be recovered blocks neither the others nor the machine: it is renamed and reported in a message.
 """
 
 from __future__ import annotations

@@ -17,7 +17,7 @@ from abbe.service.storage.store import Store
 MIB = 1 << 20
 SUFFIX = ".seg"
 ORPHAN = ".orphan"
-"""Suffix of a segment set aside because this database has no run for it, or a closed run without some of its records."""
+"""Suffix of a segment set aside because this database has no run for it, or because its closed run lacks some of its records."""
 CONFLICT = ".conflict"
 """Suffix of a segment set aside because it contradicts the database or cannot be read."""
 DAMAGED_SUFFIX = ".damaged"
