@@ -77,7 +77,7 @@ class Begin:
     stated: MachineFileSummary | None
 
     def stating(self, stated: MachineFileSummary) -> Begin:
-        """This message with as much of the machine file as it can hold."""
+        """Return this message with as much of the machine file as fits into it."""
         return replace(self, stated=stated.within(LARGEST_B - len(encode(replace(self, stated=None)))))
 
 
@@ -183,7 +183,7 @@ class WebRequest:
 class StartJob(WebRequest):
     """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job.
 
-    ``alarm``: a full campaign looks for the cause of this alarm; 0: of none.
+    ``alarm``: number of the alarm whose cause a full campaign looks for; 0: no alarm.
     """
 
     kind: Literal["start"] = "start"
