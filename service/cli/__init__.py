@@ -82,7 +82,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 
 
 def _value_told(text: str, cause: BaseException) -> str:
-    """Return an error about one value with the expected and the given value in place of the library's words."""
+    """Return an error that states the expected and the given value instead of the library's message."""
     from pydantic import ValidationError
 
     from abbe.service.errors import mistakes

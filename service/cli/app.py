@@ -92,9 +92,9 @@ give_form(app)
 
 
 def named_by(words: Sequence[str]) -> typer.Typer:
-    """Return the tree with nothing but the command or group that the first word names; the whole tree if it names none.
+    """Return the tree with only the command or group that the first word names; the whole tree if the word names none.
 
-    To read the options of sixty others takes a tenth of the time of a short command.
+    Reading the options of the sixty others takes a tenth of the time of a short command.
     """
     first = words[0] if words else ""
     own = [one for one in app.registered_commands if one.name == first]

@@ -1,4 +1,4 @@
-"""Shared by commands: sorted help and ``--out``, how machine and database are named, and output for people and for programs."""
+"""Functions that commands share: sorted help, ``--out``, the choice of machine and database, and output for people and for programs."""
 
 from __future__ import annotations
 
@@ -53,7 +53,7 @@ JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout."
 
 
 def named_machine(given: Path | None) -> Path | None:
-    """Return the machine file of a command: of ``-m``, else of ``ABBE_MACHINE``, else ``abbe.toml`` in this folder, else None."""
+    """Return the machine file of a command: from ``-m``, else from ``ABBE_MACHINE``, else ``abbe.toml`` in this folder, else None."""
     if given is not None:
         return given
     if named := os.environ.get(MACHINE_ENVIRONMENT):
@@ -67,7 +67,7 @@ def machine_file(given: Path | None) -> Path:
     Raises
     ------
     ConfigError
-        None is named (`named_machine`).
+        No machine file is named (`named_machine`).
     """
     from abbe.service.errors import ConfigError
 
@@ -276,7 +276,7 @@ def give_form(app: typer.Typer) -> None:
 
 
 def _with_out(work: Any) -> Any:
-    """Return a command with ``--out FILE``; one that has its own keeps it. A command that fails leaves a file as it was."""
+    """Return a command with the option ``--out FILE``, unless it has its own. A command that fails leaves the file as it was."""
     signature = inspect.signature(work, eval_str=True)
     if "out" in signature.parameters or "context" in signature.parameters:
         return work

@@ -52,8 +52,8 @@ def interferometer(
 ) -> None:
     """Find the cyclic error of an interferometer (periodic nonlinearity): orders 1 and 2 per fringe, with U.
 
-    From its quadrature signals, or from a slow linear run whose position is known much better than a fringe. The samples must be in the
-    order in which they were taken.
+    The error is found from the quadrature signals, or from a slow linear run whose position is known much better than a fringe. The
+    samples must be in the order in which they were taken.
     """
     from abbe.service.instrument_files.interferometer import answer_doc, cyclic_error_of, lines_of
 

@@ -68,7 +68,7 @@ def plan(  # noqa: PLR0913 - one argument for each option
 
 
 def _plan_poses(site: Site, artefact: Path, minutes: float, out: Path | None, *, as_json: bool) -> None:
-    """Plan the poses of an artefact; print what each buys, and write the recipe."""
+    """Plan the poses of an artefact; print the gain of each, and write the recipe."""
     from abbe.service.campaigns.plan_poses import HEADINGS as POSE_HEADINGS
     from abbe.service.campaigns.plan_poses import plan_poses, pose_doc, pose_rows, read_artefact
     from abbe.service.cli.running import display

@@ -163,7 +163,7 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
 
 
 def _password() -> str:
-    """Read a password: typed twice and hidden at a terminal, else the first line of stdin. Other users could see an argument."""
+    """Read a password: typed twice and hidden at a terminal, else the first line of stdin. Other users could see it as an argument."""
     from abbe.service.errors import PasswordRefused
 
     if not sys.stdin.isatty():

@@ -39,9 +39,10 @@ def discover(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
-    Runs with the role identify are fitted, those with holdout only judge, those with sealed are predicted. A folder's result is stored
-    only if --db or -m names a database. After Ctrl-C the same command resumes. Runs at standstill with temperatures show the thermal
-    response instead (ISO 230-3), points of artefacts the errors that move with the part and those of the machine; neither is stored.
+    Runs with the role identify are fitted, runs with the role holdout only judge the fit, and sealed runs are predicted. A folder's
+    result is stored only if --db or -m names a database. After Ctrl-C the same command resumes. Instead, runs at standstill with
+    temperatures show the thermal response (ISO 230-3), and points of artefacts show which errors move with the part and which belong to
+    the machine; neither result is stored.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.discovery.discovery_answer import answer_doc
@@ -75,7 +76,7 @@ def discover(  # noqa: PLR0913 - one argument for each option
 
 
 def _without_search(campaign: Campaign, *, plain: bool, as_json: bool) -> bool:
-    """Print the thermal response of runs at standstill, or what moves with an artefact; False if these are other runs."""
+    """Print the thermal response of runs at standstill, or the errors that move with an artefact; False if the runs are of another kind."""
     from abbe.service.cli.common import answer
     from abbe.service.discovery import artefact_finding, standstill
     from abbe.service.errors import ConfigError

@@ -62,7 +62,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Import a campaign folder, or files of instruments as one campaign after a preview: all of it or, after any mistake, nothing.
+    """Import a campaign folder, or files of instruments as one campaign after a preview; any mistake leaves the database unchanged.
 
     Files: .rtl, .rta, .rtx, .pos, .REN, .b5r, and tables (.csv, .tsv, .txt, .xlsx) with --columns or, at a terminal, after questions
     about their columns; the answers are kept as FILE.columns.toml. Lists of an artefact's points, one file for each pose,
@@ -216,7 +216,7 @@ def _prompted(text: str, usual: str) -> str:
 
 
 def _asked(contents: Sequence[Content], answers: Answers) -> Answers:
-    """Answers completed at the terminal; unchanged without one."""
+    """Return the answers, completed at the terminal; without a terminal, unchanged."""
     from dataclasses import replace
 
     from abbe.service.instrument_files.answers import checked, open_questions

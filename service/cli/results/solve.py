@@ -167,7 +167,7 @@ class _SolveRequest:
 
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
-    """Yield the store and its campaign of that name. An unknown name is a StoreError, which says that it is no folder either."""
+    """Yield the store and its campaign of that name. Raises StoreError for an unknown name, which is no folder either."""
     from abbe.service.campaign_data.campaign_folder import from_store
     from abbe.service.errors import StoreError
 

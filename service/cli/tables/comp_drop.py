@@ -34,7 +34,7 @@ def drop(  # noqa: PLR0913 - one argument for each option
 ) -> None:
     """Put exported tables where a control reads them, keep the previous files, and confirm by the files that the control exports.
 
-    One of --to, --back, --seen, --take-back. A person loads the tables at the control.
+    Give one of --to, --back, --seen, --take-back. A person loads the tables at the control.
     """
     from abbe.service.clock import SystemClock
     from abbe.service.compensation import file_drop
