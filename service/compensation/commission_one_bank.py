@@ -1,8 +1,8 @@
-"""Commissioning of a control with one table at its lower level, which a person asks for by name (`abbe comp commission --one-bank`).
+"""Commissioning of a control with one table, for the lower level that a person requests explicitly (`abbe comp commission --one-bank`).
 
-The assumptions of the exchange are tested with a copy of the table in force: the control has to refuse writes while its table acts,
-and switches with a wrong CRC. Compensation is off for some tenths of a second, while the machine stands; an axis may move by its present
-correction.
+The assumptions behind an exchange of tables are tested with a copy of the table in force: the control has to refuse writes while its
+table acts, and any switch with a wrong CRC. Compensation is off for some tenths of a second, while the machine stands; an axis may move
+by its present correction.
 """
 
 from __future__ import annotations

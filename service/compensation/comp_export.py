@@ -54,7 +54,7 @@ class Exported:
 
 
 def scales_badly_known(doc: dict[str, Any]) -> Scales | None:
-    """The scales, if they are the largest part of a stored solution's uncertainty; None if another source is larger."""
+    """Return the scales if they are the largest part of a stored solution's uncertainty, else None."""
     found = ((doc.get("uncertainty") or {}).get("without_scale") or {}).get("scales")
     return found if found in SCALE_TEXTS else None
 
@@ -140,7 +140,7 @@ def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> d
 
 
 def control_for(key: str) -> ControlModel:
-    """A control by its key; for the key of a format, a control that has that format only.
+    """Return the control with this key; for the key of a format, a control that has only this format.
 
     Raises
     ------
@@ -302,7 +302,7 @@ def expected(known: Identified, control: ControlModel, reference_mm: F1 | None =
 
 
 def alike_mm(control: ControlModel) -> float:
-    """Return the largest difference by rounding between tables read and expected, mm; of error motions, several add up."""
+    """Return the largest difference, mm, that rounding can make between read and expected tables; several error motions add up."""
     return (MOTIONS_ADD_UP if control.motions_format else 1.0) * 0.51 * control.unit_mm + 1e-6
 
 

@@ -237,7 +237,7 @@ class _PushQuestions:
 
 
 async def _push_and_verify(work: _PushQuestions, wanted: WantedTable) -> tuple[PushResult, VerificationFigures, VerificationDecision]:
-    """Push, probe, measure again, keep or roll back. Whatever stops it rolls back."""
+    """Push, probe, measure again, keep or roll back. Any interruption rolls the table back."""
     context = work.context
     if drift_reasons := work.drift_reasons():  # before the ball-bar is read
         raise TableRefused.because(drift_reasons)

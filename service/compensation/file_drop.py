@@ -202,7 +202,7 @@ def receipt(source: Path) -> Drop:
     Raises
     ------
     FileFormatError
-        There is none, or it is no receipt.
+        There is no receipt, or the file is not one.
     """
     file = place_of(source) / RECEIPT
     try:

@@ -102,7 +102,7 @@ STATED = "the air's temperature is not measured: a person stated that of the roo
 
 
 def air_is_stated(site: Site, runs: list[Run]) -> bool:
-    """Whether the room's stated range stands for the air of these runs, because none of those that identify recorded it."""
+    """Whether the stated range of the room replaces the air temperature, because no identifying run recorded the air."""
     return site.room_c is not None and not any(r.columns.air_c.size for r in runs if r.identifies)
 
 
@@ -140,7 +140,8 @@ async def candidate_context(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """The tables in force `MONTH` ago: the first kept push's base if no push was kept by then, ``base`` if none ever was."""
+    """Return the tables in force `MONTH` ago. If no push was kept by then: the base of the first kept push, or ``base`` if none was ever
+    kept."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -398,7 +399,7 @@ def check_before_runs(site: Site, base: Base, runs: list[Run], since_s: float, n
     Raises
     ------
     TableRefused
-        Names a run that does not, and why.
+        Names a run that does not describe this machine, and the reason.
     """
     low, high = site.temperature_c
     for run in runs:

@@ -67,7 +67,7 @@ async def level_status(controller: Identity, store: Store, site: Site) -> LevelS
 async def _visible(controller: Identity) -> Capabilities:
     """Features that the status block shows without a test: two banks, a generation, a boot id. None of it is proved.
 
-    A control with one table shows nothing: its level is only ever given by name (`abbe comp commission --one-bank`).
+    A control with one table shows nothing: a person has to request its level (`abbe comp commission --one-bank`).
     """
     if has_one_table(controller):
         return Capabilities()

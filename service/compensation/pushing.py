@@ -39,7 +39,7 @@ UNTRUSTED_CONTROL = (
 MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0
 RECHECK_S = 2.0
-"""Pause before the second look at the controller after a push that was given up with its activation sent."""
+"""Pause before the second look at the controller, if a push was given up after its activation was sent."""
 STILL_S, STILL_POLL_S, STILL_LIMIT_S = 1.2, 0.05, 15.0
 """How long the axes have to stand before a table may change; interval and limit of waiting for it."""
 
@@ -218,7 +218,7 @@ class Pushing:
         Raises
         ------
         TableMismatch
-            It has.
+            The control has activated the table.
         """
         if ended.state is not PushState.ABORTED or PushState.ACTIVATING not in {entry.state for entry in ended.journal}:
             return
@@ -235,7 +235,7 @@ class Pushing:
         return self._stop or ("stopped by a person" if self.control.stopping or self.control.aborting else "")
 
     async def _failed(self, port: ControllerPort, book: StoreBook, failed: BaseException) -> BaseException:
-        """Try recovery once after a journal error or a defect; add a note to the error about how that ended, and return it."""
+        """Try recovery once after a journal error or a defect; return the error with a note on the outcome of the recovery."""
         try:
             ended = await run_to_end(execute.recover(port, book))
         except Exception as again:  # noqa: BLE001 - the first failure is raised in any case, with what is known

@@ -126,8 +126,8 @@ def _summary(ended: execute.Ended, before: PushState) -> str | None:
 async def accept(controller: TableController, store: Store, site: Site, by: str = "a person") -> str:
     """Record that a person vouches for the active table, and close every open push of it, whatever machine name it was begun under.
 
-    An interrupted push that can be finished is finished instead and nothing is accepted: another table may be in force then than the person
-    saw. ``by`` is kept in the journal. Returns what was done.
+    If an interrupted push can be finished, it is finished and nothing is accepted, since the table in force may then not be the one that
+    the person saw. ``by`` is kept in the journal. Returns what was done.
 
     Raises
     ------
