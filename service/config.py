@@ -195,7 +195,7 @@ def _overrides() -> dict[str, Any]:
 
 
 def _place(parts: list[str]) -> list[str]:
-    """The keys of a variable, spelled as in the file; an unknown one in small letters."""
+    """Return the keys of a variable, spelled as in the file; keys that the file does not know, in small letters."""
     place, keys = [], _keys(MachineFile)
     for part in parts:
         place.append(next((key for key in keys if key.upper() == part), part.lower()))
