@@ -24,7 +24,7 @@ SHORTEST_MM, LONGEST_MM = 50.0, 50_000.0
 COLDEST_C, WARMEST_C = -20.0, 50.0
 """Plausible air temperatures; a window such as 68 to 72 is in Fahrenheit."""
 CERTIFICATES = (date(2000, 1, 1), date(2199, 12, 31))
-"""Earliest and latest plausible last day of a certificate; the demonstration's are of 2099."""
+"""Earliest and latest plausible last day of a certificate; certificates of the demonstration end in 2099."""
 
 
 def _celsius(window: tuple[float, float]) -> tuple[float, float]:
@@ -43,7 +43,7 @@ def _certificate(day: date | None) -> date | None:
 
 
 Coefficient = Annotated[float, Field(ge=-1e-5, le=1e-4)]
-"""Bounds of an expansion coefficient, 1/K: negative for some glass ceramics and fibres; a number in µm/m/K is above the largest."""
+"""Bounds of an expansion coefficient, 1/K: negative for some glass ceramics and fibres; a value in µm/m/K exceeds the upper bound."""
 CoefficientUncertainty = Annotated[float, Field(gt=0.0, le=1e-5)]
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
 ROOM_K = 1.0
