@@ -120,7 +120,7 @@ class StatePublisher:
         self._publisher.set_state("measuring", at_utc, schedule=schedule.name)
 
     def job_progress(self, progress: Progress) -> None:
-        """Do nothing: the state is retained, so every change is a write in the broker. Progress is for the page."""
+        """Do nothing: the broker would write every change of a retained message to disk. The page shows the progress."""
 
     def job_ended(self, doc: Doc | None) -> None:
         """Publish that the service is online and idle."""

@@ -53,7 +53,7 @@ BY_ITSELF = "this service pushes approved proposals by itself ([alarm] push), or
 class CampaignOrder:
     """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it.
 
-    ``cause``: the alarm whose cause it looks for, and the function that writes its lines; None: of no alarm.
+    ``cause``: the alarm whose cause the campaign looks for, and the function that writes the alarm's lines; None: no alarm.
     """
 
     recipe: str
@@ -64,7 +64,7 @@ class CampaignOrder:
 
 
 MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
-"""``await measure(order)``: measures, solves, proposes; for an alarm its lines tell the outcome."""
+"""``await measure(order)``: measures, solves, proposes; if an alarm is the cause, its lines tell the outcome."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -161,7 +161,7 @@ def full_campaigns(
     may: Callable[[str], Awaitable[bool]],
     alarms: AlarmManager | None = None,
 ) -> FullCampaigns:
-    """Return the entry of full campaigns for the registry of jobs.
+    """Return the full campaigns as the registry of jobs needs them.
 
     Parameters
     ----------

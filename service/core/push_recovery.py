@@ -42,7 +42,7 @@ IsOpen = Callable[[], Awaitable[bool]]
 
 
 class PushRecovery:
-    """Tries until nothing is open, and starts again when a push ends unfinished.
+    """Retries the recovery until no run and no push is open, and starts again when a push ends unfinished.
 
     Parameters
     ----------

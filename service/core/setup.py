@@ -68,11 +68,11 @@ class ServiceSetup:
     summary : MachineSummary, optional
         The page's data for dry runs.
     actions : callable, optional
-        Given the store, returns the orders for tables that a person can give; None: none.
+        Given the store, returns the orders for tables that a person can give; None: no orders.
     campaigns : tuple of str
         Full campaigns that a person may start, if ``campaign`` is given.
     campaign : callable, optional
-        Given the store, returns the function that measures, solves and proposes one.
+        Given the store, returns the function that measures and solves a full campaign and proposes tables.
     """
 
     machine: str

@@ -121,7 +121,7 @@ class TableWatch:
         self._reported: tuple[int, str] | None = None
 
     async def run(self) -> None:
-        """Watch forever. A controller that does not answer says nothing about its table; other parts report that."""
+        """Watch forever. A controller that does not answer is no fault of its table; other parts report the silence."""
         while True:
             in_force = await self._read()
             if in_force is not None and self._problem(in_force):

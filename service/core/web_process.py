@@ -74,7 +74,7 @@ async def show_live(wire: Wire, live: LiveFeed, clock: Clock) -> None:
 
 
 def _send_path(wire: Wire, live: LiveFeed, sent: int) -> int:
-    """Tell the page of a new path, or that there is none any more; return the number of the path that it knows, 0: none."""
+    """Tell the page of a new path, or that the path has ended; return the number of the path that the page knows, 0: none."""
     path = live.path
     number = 0 if path is None else path.number
     if number != sent:
@@ -240,7 +240,8 @@ class WebProcess:
         return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
-        """Wait for the process to end, since its channel has closed; kill it after `GOODBYE_S`, since nothing in it can be lost."""
+        """Wait for the end of the process, whose channel has closed; kill it after `GOODBYE_S`, since it holds nothing that could be
+        lost."""
         if self._up:
             with suppress(TimeoutError):
                 async with asyncio.timeout(GOODBYE_S):
