@@ -19,8 +19,8 @@ LEFT = 2.0
 
 @dataclass(frozen=True, eq=False)
 class ArtefactFinding:
-    """``shares``: the named fields in part and machine, empty unless one plate lay in poses in a plane (``rank``). ``waves``: periods of
-    the machine's motions. ``scatter``: of the points, as multiple of their repeatability."""
+    """``shares``: shares of part and machine in the named fields, empty unless one plate lay in several poses in a plane (``rank``).
+    ``waves``: periods of the machine's motions. ``scatter``: scatter of the points as a multiple of their repeatability."""
 
     campaign: str
     solved: Solved

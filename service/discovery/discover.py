@@ -47,10 +47,10 @@ class DiscoveryJob:
     """Input of a discovery.
 
     ``campaign``: as measured. ``runs``: its runs, decimated (`abbe.service.campaign_data.decimation`) and without the effect of an active
-    table, which is in ``table_mm`` by run. ``case``: these runs, also without the effects of the model book (version ``base``), whose
-    contributions are in ``known_mm`` by run and whose labels are in ``known``. ``effects``: the catalogue. ``flags``: doubtful features of
-    single runs, and effects that decimation hides. ``thinning``: the decimation in numbers, None without any. ``since``: the solution to
-    compare with.
+    table; ``table_mm``: this effect by run. ``case``: these runs, also without the effects of the model book's version ``base``; ``known``:
+    labels of these effects; ``known_mm``: their contributions by run. ``effects``: the catalogue. ``flags``: doubtful features of single
+    runs, and effects that decimation hides. ``thinning``: the decimation in numbers, None without any. ``since``: the solution to compare
+    with.
 
     ``expected_version``: the version that must still be the current one when this discovery adds its own: the newest at its start, or the
     one added by the discovery that it continues.

@@ -1,7 +1,7 @@
 """Continue a discovery on the connected machine: measure the proposal, join it with the old campaign, search again.
 
-All state is stored. The document of a continuing campaign names its plan and the campaign that it continues. Joined, the two campaigns form
-a new one, whose discovery is found in the store by its readings. So the same command resumes wherever it was stopped.
+All state is stored. The document of a continuing campaign names its plan and the campaign that it continues. The two campaigns joined
+form a new campaign, and its readings identify its discovery in the store. So the same command resumes wherever it was stopped.
 """
 
 from __future__ import annotations

@@ -23,18 +23,18 @@ FOLLOWS: dict[State | None, frozenset[State]] = {
 }
 ENDS = frozenset({"EXPLAINED", "UNEXPLAINED"})
 VISIBLE = 1.05
-"""Smallest ratio of gap to noise floor, without the effect, at which holdout runs can judge; below it they do not show the effect."""
+"""Smallest ratio of the gap without the effect to the noise floor at which holdout runs can judge; below it they do not show the effect."""
 CLOSED = 0.5
 """Share of the gap (`GapUm.closed`) that must close on the holdout runs. A wrong effect closes it on the fitted runs only."""
 SOME = 0.2
-"""A smaller share of the gap also closes by chance."""
+"""Smallest closed share of the gap that counts: a smaller share also closes by chance."""
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller gap may also be the prediction's own
 error, so it does not refute an effect with which the holdout runs agree better."""
 WORSE = 1.05
 """Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0
-"""Lead in evidence (natural logarithm) over every rival that an effect needs for the model book: twenty times as likely."""
+"""Smallest lead in log evidence over every rival with which an effect enters the model book: twenty times as likely."""
 NOT_CONFIRMED = "the holdout runs do not agree better with the effect than without it"
 
 

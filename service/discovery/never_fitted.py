@@ -1,4 +1,4 @@
-"""Runs outside the fit that disagree by more than chance although nothing is missing in the fitted runs."""
+"""Find runs outside the fit that deviate by more than chance, although the fitted runs show no missing effect."""
 
 from __future__ import annotations
 

@@ -19,7 +19,7 @@ from abbe.service.rendering.numbers import plain, with_uncertainty
 FORMAT = "abbe-standstill/1"
 TEMPERATURE = re.compile(r"temp_(\w+)_C")
 GAIN = 0.9
-"""The lagged response explains something if it leaves less than this share of the displacement in runs left out."""
+"""The lagged response explains something if it leaves less than this share of the displacement in runs outside the fit."""
 
 
 @dataclass(frozen=True, eq=False)
