@@ -1,4 +1,4 @@
-"""Facts of a campaign made of other programs' files, beside its runs: origin, readings without a run, stated figures."""
+"""Facts, besides the runs, of a campaign made of other programs' files: origin, readings without a run, stated figures."""
 
 from __future__ import annotations
 
@@ -23,10 +23,10 @@ class SourceFile(FileObject):
 
 
 class OtherReadings(FileObject):
-    """Readings of one axis that are no run, one list per column.
+    """Readings of one axis that belong to no run, one list per column.
 
-    ``angle``: of an angular instrument, rad; ``mean``: means of both directions as a file states them, mm, whose ``direction`` is 0.
-    ``resolution``: smallest step of the readings, rad or mm.
+    ``angle``: readings of an angular instrument, rad; ``mean``: means of both directions as a file states them, mm; their ``direction``
+    is 0. ``resolution``: smallest step of the readings, rad or mm.
     """
 
     kind: Literal["angle", "mean"]

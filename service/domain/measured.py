@@ -386,7 +386,7 @@ class CampaignHead:
 
     @property
     def zero_us(self) -> int:
-        """Zero of the clock of a campaign that was measured here. Raises StoreError for another."""
+        """Zero of the clock of a campaign that was measured here. Raises StoreError for any other campaign."""
         if self.ctrl0_us is None:
             raise StoreError("the campaign has no clock of the controller", "only a campaign that Abbe measured can be continued")
         return self.ctrl0_us
@@ -406,7 +406,7 @@ class CampaignRecord(DocumentRow):
 
     @property
     def known(self) -> Doc:
-        """What is known of machine, instruments and artefacts: of an imported campaign the document that was imported."""
+        """Return what is known of machine, instruments and artefacts; for an imported campaign, the imported document."""
         return self.doc.get("imported") or self.doc
 
 

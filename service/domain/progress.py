@@ -62,7 +62,7 @@ class RunningCheck(Progress):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RecordedPath:
-    """A path that is being recorded. ``number`` 0: none is.
+    """A path that is being recorded. ``number`` 0: there is no path.
 
     ``angle_deg``: angle about the axis of the test at equal steps along the path; it grows beyond 360° instead of wrapping.
     """

@@ -31,7 +31,7 @@ class PushState(StrEnum):
     VERIFIED = "VERIFIED"
     KEEP = "KEEP"
     ROLLBACK = "ROLLBACK"
-    """The new table has to go; permits preparing the rollback."""
+    """The new table must not stay; permits preparing the rollback."""
     RESTAGING = "RESTAGING"
     """Permits writing the old table into the inactive bank."""
     ACTIVATING_BACK = "ACTIVATING_BACK"

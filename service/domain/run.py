@@ -82,7 +82,7 @@ class Columns:
 
     @property
     def of_artefact(self) -> bool:
-        """Whether these are points of an artefact."""
+        """Whether the readings are points of an artefact."""
         return FEATURE in self.further
 
     @property
@@ -133,7 +133,7 @@ class Columns:
         )
 
     def equals(self, other: Columns) -> bool:
-        """Whether both have the same columns with the same numbers."""
+        """Whether another object has the same columns with the same numbers."""
         mine, theirs = self.by_name(), other.by_name()
         return mine.keys() == theirs.keys() and all(_same(values, theirs[name]) for name, values in mine.items())
 
@@ -180,7 +180,7 @@ class Setup:
     document: Doc = field(repr=False)
 
     def __eq__(self, other: object) -> bool:
-        """Whether both say the same."""
+        """Whether another set-up has the same values."""
         return isinstance(other, Setup) and self.document == other.document
 
     def mounted(self, t_set_s: float) -> Self:
@@ -294,7 +294,7 @@ class ArtefactSetup(Setup):
 
     @property
     def by_machine(self) -> bool:
-        """Whether the machine's probe found the points; else the machine made them and a CMM found them."""
+        """Whether the machine's probe found the points; otherwise the machine made the features and a CMM found their points."""
         return self.source == MACHINE_PROBE
 
 
@@ -417,12 +417,12 @@ class Run:
 
     @property
     def is_bar(self) -> bool:
-        """Whether a ball-bar read it."""
+        """Whether a ball-bar made the readings."""
         return isinstance(self.setup, BarSetup)
 
     @property
     def is_artefact(self) -> bool:
-        """Whether these are points of an artefact."""
+        """Whether the readings are points of an artefact."""
         return isinstance(self.setup, ArtefactSetup)
 
     @property
@@ -432,12 +432,12 @@ class Run:
 
     @property
     def is_sealed(self) -> bool:
-        """Whether its readings are withheld."""
+        """Whether the readings are withheld."""
         return self.columns.deviation_mm is None and not self.columns.of_artefact
 
     @property
     def identifies(self) -> bool:
-        """Whether solutions and searches are fitted to it."""
+        """Whether solutions and searches are fitted to this run."""
         return self.role == "identify"
 
     @property
@@ -447,7 +447,7 @@ class Run:
         Raises
         ------
         MeasurementFault
-            It is a run of a laser or an artefact.
+            The run is of a laser or an artefact.
         """
         if not isinstance(self.setup, BarSetup):
             raise MeasurementFault(f"run {self.run_id} was not measured with a ball-bar", "leave it out")
@@ -460,7 +460,7 @@ class Run:
         Raises
         ------
         MeasurementFault
-            It is a run of a ball-bar or an artefact.
+            The run is of a ball-bar or an artefact.
         """
         if not isinstance(self.setup, LaserSetup):
             raise MeasurementFault(f"run {self.run_id} was not measured with a laser", "leave it out")
@@ -473,7 +473,7 @@ class Run:
         Raises
         ------
         MeasurementFault
-            The set-up states no beam, or it is a ball-bar run.
+            The set-up states no beam, or the run is not of a laser.
         """
         setup = self.laser
         beam = setup.nominal_beam
@@ -486,7 +486,7 @@ class Run:
         return np.asarray(beam / length)
 
     def with_artefact(self, campaign: Doc) -> Run:
-        """The run with its artefact and CMM as the campaign's document states them; another run stays as it is.
+        """Return the run with its artefact and CMM as the campaign's document states them; a run without an artefact stays as it is.
 
         Raises
         ------

@@ -16,7 +16,7 @@ from pydantic import AfterValidator, AwareDatetime, Field
 from abbe.service.domain.bounds import WORD
 
 FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
-"""Intervals are counted from here unless the machine file names another instant."""
+"""Instant from which intervals are counted, unless the machine file names another."""
 SHORTEST_H = 1 / 60
 """The shortest interval of a schedule."""
 
@@ -53,7 +53,7 @@ Cron = Annotated[str, AfterValidator(_cron)]
 
 @dataclass(frozen=True, slots=True)
 class Needs:
-    """Conditions for the start of a check, which waits for them during its grace."""
+    """Conditions for the start of a check; during its grace the check waits for them."""
 
     idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
     warm_min: Annotated[

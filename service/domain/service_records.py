@@ -17,7 +17,7 @@ SILENT_AFTER = timedelta(seconds=3 * BEAT_S)
 
 
 class AlarmKind(StrEnum):
-    """Kind of an entry. The first five change the alarm itself, the others record the work on it; a person ``ordered`` some of it."""
+    """Kind of an entry. The first five change the alarm itself; the others record the work on it, some of which a person ``ordered``."""
 
     RAISED = "raised"
     CONTINUED = "held"

@@ -14,7 +14,7 @@ Digest = str
 
 
 class Versions(FileObject):
-    """Versions of the programs that solved it."""
+    """Versions of the programs that solved the campaign."""
 
     abbe: str
     numpy: str
@@ -215,7 +215,8 @@ class StoredPrediction(FileObject):
 class TableRow(FileObject):
     """Errors of distances that remain when a kind of table is used, over the inner 80 % of every stroke, µm, with standard uncertainties.
 
-    ``entries``: count of numbers in the table. ``q95_um``: 95 % are below. ``unknown_um``: rms of the part that no table can remove.
+    ``entries``: count of numbers in the table. ``q95_um``: 95 % of the errors are below. ``unknown_um``: rms of the part that no table
+    can remove.
     """
 
     kind: str
@@ -266,7 +267,7 @@ class TableRemoval(FileObject):
 class SolutionFile(FileObject):
     """A solved campaign (``abbe-solution/1``). Every ``u`` is a standard uncertainty (k = 1); ``expanded_um`` has 95 % coverage.
 
-    ``solution_id``, ``run_ids`` and ``same_as`` (earlier solutions of the same readings and model) are there when it was stored.
+    ``solution_id``, ``run_ids`` and ``same_as`` (earlier solutions of the same readings and model) are present in a stored solution.
     """
 
     format: Literal["abbe-solution/1"]
@@ -327,7 +328,7 @@ def stored_solution(doc: object, number: int) -> SolutionFile:
     Raises
     ------
     Unusable
-        Another version stored it in another form.
+        Another version of Abbe stored the solution in another form.
     """
     try:
         return SolutionFile.read(doc)

@@ -52,7 +52,7 @@ class Verification:
 
     @property
     def figures(self) -> tuple[CheckFigure, ...]:
-        """Its figures, in their order."""
+        """The figures of the check, in their order."""
         found = self.values.items()
         return tuple(CheckFigure(name, value, self.uncertainties.get(name), self.limits.get(name)) for name, value in found)
 
