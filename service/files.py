@@ -32,7 +32,7 @@ def file_locks() -> ModuleType:
     Raises
     ------
     ConfigError
-        The system has none (Windows): what needs them cannot work there.
+        The system has no file locks (Windows); functions that need them cannot work.
     """
     try:
         return import_module("fcntl")  # here: a system without it still plans, reads and solves
