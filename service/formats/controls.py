@@ -212,9 +212,9 @@ def choices(known: Identified, control: ControlModel, reference_mm: F1) -> tuple
 
 
 def _lines(known: Identified, control: ControlModel, reference_mm: F1) -> list[tuple[str, Compensation]]:
-    """Return squareness as three straight lines (X over Y, X over Z, Y over Z), and lost motion; a negative one is none.
+    """Return squareness as three straight lines (X over Y, X over Z, Y over Z), and lost motion; a negative lost motion is left out.
 
-    A line of Y over X is one of X over Y and a rotation of the whole machine, which is no error.
+    A line of Y over X equals a line of X over Y plus a rotation of the whole machine, which is no error.
     """
     lost = {a: v for a, v in known.lost_motion_mm.items() if v > 0.0}
     if not control.squareness:

@@ -1,9 +1,10 @@
 """Squareness and lost motion as commands of Marlin, Klipper and grblHAL, which hold no tables.
 
 Marlin and Klipper command x − y·xy − z·(xz − xy·yz) and y − z·yz (both sources alike: Marlin planner.h, Klipper skew_correction.py): a
-factor is the deviation of an axis for a unit of travel of another, +e. Klipper takes it as three lengths of a figure with sides of 100 mm:
-diagonals AC and BD, side AD. Lost motion: M425 of Marlin (needs BACKLASH_GCODE) and $160 to $162 of grblHAL (needs a build with
-ENABLE_BACKLASH_COMPENSATION); Klipper has none, grblHAL no skew. Zero is the machine's own zero: another one shifts the whole map.
+factor is the deviation of an axis for a unit of travel of another, +e. Klipper takes it as three lengths of a figure with sides of 100
+mm: diagonals AC and BD, side AD. Lost motion: M425 of Marlin (needs BACKLASH_GCODE) and $160 to $162 of grblHAL (needs a build with
+ENABLE_BACKLASH_COMPENSATION); Klipper compensates no lost motion, grblHAL no skew. Zero is the machine's own zero: another one shifts
+the whole map.
 """
 
 from __future__ import annotations
@@ -29,7 +30,7 @@ SIGN = SignRule(1, False, "by manual", True, "the program's source: skew +e for 
 
 @dataclass(frozen=True, slots=True)
 class SkewProgram:
-    """One program: what it is called, its file, and what it can hold."""
+    """One program: its name, its file, and what the file can hold."""
 
     what: str
     name: str
