@@ -16,7 +16,7 @@ from abbe.models.solvers.plate_fit import plate_fit
 from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 
 SENSED = 1e-3
-"""An axis along which no reading of a campaign has a larger direction cosine was not sensed."""
+"""Direction cosine up to which an axis counts as not sensed: no reading of the campaign has a larger one along it."""
 COVERAGE = 2.0
 ONE_PLANE_MM = 5.0
 """Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""
@@ -28,8 +28,8 @@ NOT_SENSED = "; the third direction was not sensed"
 
 
 def artefact_lines(joint: JointSolution) -> list[str]:
-    """Return sentences: errors that the poses of an artefact hide, and the pose that would show them; how the named error fields split into
-    artefact and machine; a fit of every workpiece by itself."""
+    """Return sentences: errors that the poses of an artefact hide, and the pose that would show them; the shares of artefact and machine
+    in the named error fields; and the separate fit of every workpiece."""
     rank = pose_rank(joint.data)
     poses = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
     return poses + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
@@ -97,7 +97,7 @@ def _offered(value_mm: F2, u_mm: F2) -> float:
 
 
 def _fine(joint: JointSolution, points_mm: F2) -> tuple[tuple[Fine, ...], F1]:
-    """Return the waves of the machine's motions, and for each direction what changes from one position to the next, mm."""
+    """Return the waves of the machine's motions, and for each direction the variation from one position to the next, mm."""
     fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
     scatter = np.zeros(3)
     for one in fine:
@@ -108,7 +108,7 @@ def _fine(joint: JointSolution, points_mm: F2) -> tuple[tuple[Fine, ...], F1]:
 
 
 def _above_rough(joint: JointSolution) -> F1:
-    """Return the variance of a rough motion of each axis above the orders of the model, mm^2, shape (3,); zero without rough motions."""
+    """Return the variance of each axis' rough motion above the orders of the model, mm^2, shape (3,); zero without rough motions."""
     last = max(t.order for t in joint.terms)
     if last <= SMOOTH_ORDER:
         return np.zeros(3)
@@ -122,7 +122,7 @@ def _above_rough(joint: JointSolution) -> F1:
 
 
 def _frame(points_mm: F2, keep: list[int], *, scale: bool) -> F2:
-    """Rigid motions in the kept directions (and a common scale) at points, shape (n * kept, motions)."""
+    """Return the rigid motions in the kept directions (and a common scale) at points, shape (n * kept, motions)."""
     away, unit = points_mm - points_mm.mean(axis=0), np.eye(3)
     turns = [k for k in range(3) if len(keep) == 3 or k not in keep]
     columns = [np.tile(unit[k], (len(away), 1)) for k in keep] + [np.cross(unit[k], away) for k in turns]

@@ -1,9 +1,9 @@
 """Subtract from a campaign's readings what a new table must not correct: side effects of the table in force, and effects of other remedies.
 
-Of a table in force, all beyond smooth corrections is subtracted. It is known exactly, from the controller or the database. Its moves of
-the axes suffer lost motion, and interpolation and rounding add to them: both effects are subtracted. The machine's lost motion is solved
-first, preferably without step diagonals, in which the table alone moves axes that are commanded to rest. A table that is not available
-widens the covariance instead (`with_unknown_table`).
+Everything that a table in force does beyond smooth corrections is subtracted. The table is known exactly, from the controller or the
+database. Lost motion changes the moves that it commands, and interpolation and rounding add to them: both effects are subtracted. The
+machine's lost motion is solved first, preferably without step diagonals, in which the table alone moves axes that are commanded to rest.
+A table that is not available widens the covariance instead (`with_unknown_table`).
 """
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:
 
 
 def subtract_table(runs: list[Run], out: RemovedTable) -> list[Run]:
-    """Subtract a table's effect from runs; one of an artefact or without readings stays unchanged."""
+    """Subtract a table's effect from runs; runs of artefacts and runs without readings stay unchanged."""
     return [_subtracted(run, out) for run in runs]
 
 
@@ -157,8 +157,8 @@ def _added_mm(run: Run, axes_mm: F2, force: AppliedTables) -> F1:
 TABLES = 16
 """Number of drawn tables; their effect has about this many degrees of freedom."""
 ORDER, NODES, SPACING_MM, UNIT_MM, SEED = 6, 5, 25.0, 1e-4, 16
-"""Of the drawn tables: highest Legendre order of the errors that they correct, nodes per axis of their fit, distance of their points, unit
-of their entries."""
+"""Properties of the drawn tables: highest Legendre order of the errors that they correct, nodes per axis of their fit, distance of their
+points, unit of their entries; and the seed."""
 
 
 def with_unknown_table(solution: JointSolution) -> JointSolution:

@@ -46,9 +46,9 @@ class StoredField:
         Raises
         ------
         NotObservable
-            The runs do not show one of them separately.
+            The runs do not show one of the motions separately.
         Unusable
-            The solution does not have one of them.
+            The solution lacks one of the motions.
         """
         wanted = list(dict.fromkeys(motions))
         unknown = [name for name in wanted if name not in self.motions]

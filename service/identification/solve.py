@@ -66,9 +66,9 @@ class Solved:
     ``flags``: doubtful features of single runs that may be right. ``digests``: hash of every run's data as measured, by run label.
     ``tables``: the compensation table of each run, if its document states one. ``removed``: descriptions of effects subtracted from the
     readings. ``rows``: first and last row of the run's file (from 1) that each value was made of, shape (values, 2). ``holds_at``:
-    temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs,
-    beyond which the map is the prior's. ``inputs``: stated uncertainties that no reading shows.
-    ``undone``: faults of runs of artefacts (exchanged features, a turn, a motion) that the solution corrected by itself.
+    temperature of the scales at which the result holds, as text. ``reached_mm``: lowest and highest position of each axis in the runs;
+    beyond them the map is only the prior. ``inputs``: stated uncertainties that no reading shows. ``undone``: faults of runs of
+    artefacts (exchanged features, a turn, a motion) that the solution corrected by itself.
     """
 
     joint: JointSolution
@@ -96,7 +96,7 @@ def solve_runs(
 ) -> Solved:
     """Solve runs of the role ``identify`` together, after checking each for consistency.
 
-    ``instruments``: those of the campaign file; what they do not know of laser and scales widens the uncertainties (`laser_inputs`).
+    ``instruments``: of the campaign file; facts about laser and scales that they do not state widen the uncertainties (`laser_inputs`).
 
     ``model`` None: rigid21, or rigid6 with a flag if the readings are too few for it or do not support it (`map_against_prior`).
 
