@@ -61,12 +61,12 @@ class Question:
 
 
 def checked(answers: Answers) -> Answers:
-    """The answers, if each is possible.
+    """Return the answers if each is possible.
 
     Raises
     ------
     FileFormatError
-        One is not.
+        An answer is impossible.
     """
     for key, choices in (("axis", ("X", "Y", "Z")), ("unit", tuple(LENGTHS)), ("sign", tuple(SIGNS))):
         value = getattr(answers, key)
@@ -131,7 +131,7 @@ def option(key: str) -> str:
 
 
 def _further(test: AxisReadings, axis: str, answers: Answers) -> dict[str, Any]:
-    """The columns of the file and, where it has none, those that were answered."""
+    """Return the further columns: those of the file, and the answers for columns that the file lacks."""
     given = {f"temp_{axis.lower()}_C": answers.scale_c, "temp_air_C": answers.air_c}
     given["pressure_air_Pa"] = None if answers.pressure_hpa is None else answers.pressure_hpa * HPA
     n = test.position_mm.size

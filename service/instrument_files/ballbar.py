@@ -21,14 +21,14 @@ UNITS = {
     "UT_SCALE_ERROR": "µm/m",
     "UT_FEEDRATE": "mm/min",
 }
-"""Unit of each data type that is a figure; others (rank, share, angle, speed) are named as not read."""
+"""Unit of each data type that is a figure; the other types (rank, share, angle, speed) are reported as not read."""
 NOT_FIGURES = ("UT_RANKING", "UT_PERCENT", "UT_ANGLE", "UT_SPEED")
 TEXTS = ("OPERATOR", "DATE_STARTED", "SERIAL_NUMBER", "LAST_CALIBRATED", "PART_NUMBER", "A_AXIS_NAME", "B_AXIS_NAME")
 NAMED = ("TEST_SPEC", "MACHINE_TESTED")
 ANALYSIS = "RENISHAW_DIAGNOSTICS"
 PLANES = ("XY", "YZ", "ZX")
 ENCODINGS = frozenset(("utf-8", "us-ascii", "iso-8859-1", "windows-1252", "gbk", "gb2312", "gb18030"))
-"""Encodings that are decoded here; the parser decides about any other."""
+"""Encodings that are decoded here; for any other the parser decides."""
 _DECLARED = re.compile(
     rb"\A(?:\xef\xbb\xbf)?<\?xml\s+version=([\"'])1\.[0-9]\1\s+encoding=([\"'])(?P<encoding>[A-Za-z][A-Za-z0-9._-]*)\2"
     rb"(?:\s+standalone=([\"'])(?:yes|no)\4)?\s*\?>"
@@ -51,7 +51,7 @@ def read_b5r(name: str, data: bytes) -> Content:
     Raises
     ------
     FileFormatError
-        It is no XML, or incomplete; the message has the line.
+        The file is no XML, or incomplete; the message has the line.
     """
     file = TextFile(name, "", FileFormatError)
     elements = _elements(file, data)

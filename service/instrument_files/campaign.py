@@ -184,7 +184,7 @@ def _origin(content: Content, test: AxisReadings | None, machine: Doc | None) ->
 
 
 def _beside(contents: Sequence[Content], tests: Sequence[AxisReadings | None]) -> Doc:
-    """Readings that no run holds, and stated figures; nothing for none."""
+    """Return readings that no run holds, and stated figures; empty without any."""
     readings = [
         {
             "kind": "angle" if test.quantity == "angle" else "mean",

@@ -46,7 +46,7 @@ class MeasuredColumn(ColumnFilePart):
 
 
 class Direction(ColumnFilePart):
-    """The column that says from where a target was approached, and its words for + and - of the axis."""
+    """The column that says from which side a target was approached, and its words for + and - of the axis."""
 
     column: Column
     plus: str = "+"
@@ -141,7 +141,7 @@ def column_file(path: Path) -> ColumnFile:
     Raises
     ------
     FileFormatError
-        It has a mistake; the message names the key.
+        The file has a mistake; the message names the key.
     """
     try:
         return ColumnFile.model_validate(tomllib.loads(read_bytes(path).decode("utf-8")))
@@ -158,12 +158,12 @@ def column_file(path: Path) -> ColumnFile:
 
 
 def table_of(name: str, data: bytes, heading: int, delimiter: str | None = None, sheet: str | None = None) -> FileRows:
-    """Cells of a CSV, TSV or XLSX. The row ``heading`` shows how a text file is divided, if ``delimiter`` does not say it.
+    """Return the cells of a CSV, TSV or XLSX file. Without ``delimiter``, the row ``heading`` shows how a text file is divided.
 
     Raises
     ------
     FileFormatError
-        It is none, or has no rows.
+        The file is of another kind, or has no rows.
     """
     if name.lower().endswith((".xlsx", ".xlsm")):
         return _excel(name, data, sheet)
@@ -247,11 +247,11 @@ class _ReadingRows:
         return self.headings.index(wanted)
 
     def numbers(self, name: str) -> tuple[F1, list[str]]:
-        """Values of a column of the column file, in its unit, and their words."""
+        """Return the values of a column of the column file, in its unit, and the texts of its cells."""
         return self.values(getattr(self.columns, name), name.replace("_", " "))
 
     def values(self, one: MeasuredColumn, what: str) -> tuple[F1, list[str]]:
-        """Values of a column, in its unit, and their words."""
+        """Return the values of a column, in its unit, and the texts of its cells."""
         k, words = self.index(one.column), list[str]()
         for row, (_, cells) in enumerate(self.rows):
             if len(cells) <= k:
@@ -307,7 +307,7 @@ def read_table(name: str, data: bytes, columns: ColumnFile) -> Content:
 
 
 def _places(body: _ReadingRows) -> tuple[F1, F1, str]:
-    """Position and direction of each reading, and a note on where they come from."""
+    """Return position and direction of each reading, and a note on their origin."""
     columns, n = body.columns, len(body.rows)
     if columns.target is None:
         at = float(columns.at_mm or 0.0)

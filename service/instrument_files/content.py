@@ -18,17 +18,17 @@ from abbe.service.formats.files import NUMBER, TextFile
 
 MAX_BYTES = 64 * 2**20
 HPA = 100.0
-"""Pa."""
+"""One hectopascal, Pa."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
 class AxisReadings:
     """A test of one axis as its file states it, n readings in their order.
 
-    ``quantity``: length (mm) or angle (rad), of ``deviation`` and its ``resolution``; ``position_mm``: targets; ``direction``: +1 where the
-    axis came in + of its own, -1, or 0 for means of both directions; ``t_s``: None if the file has no times; ``means``: each value is the
-    mean of several approaches; ``further``: columns of the format beside these (`abbe.service.domain.run.Columns`); ``sign_known``: the
-    deviation is measured - nominal, as the format says.
+    ``quantity``: length (mm) or angle (rad), of ``deviation`` and its ``resolution``; ``position_mm``: targets; ``direction``: +1 or -1
+    where the axis approached in its own + or - direction, 0 for means of both; ``t_s``: None if the file has no times; ``means``: each
+    value is the mean of several approaches; ``further``: other columns of the format (`abbe.service.domain.run.Columns`);
+    ``sign_known``: the deviation is measured - nominal, as the format says.
     """
 
     quantity: str
@@ -79,7 +79,7 @@ def read_bytes(path: Path) -> bytes:
     Raises
     ------
     FileFormatError
-        It is missing, empty, no plain file, or larger than 64 MiB.
+        The file is missing, empty, no plain file, or larger than 64 MiB.
     """
     try:
         data = read_plain(path, MAX_BYTES)
@@ -105,7 +105,7 @@ def text_file(name: str, data: bytes) -> TextFile:
     Raises
     ------
     FileFormatError
-        It holds control characters: it is not text, or damaged.
+        The file holds control characters: it is not text, or damaged.
     """
     file = TextFile(name, _decoded(data), FileFormatError)
     for line, text in file.lines():

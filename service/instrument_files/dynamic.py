@@ -16,7 +16,7 @@ from abbe.service.instrument_files.content import Content, Trace, axis_of, diges
 HEAD, DATA, END = b"HEADER::\r\n", b"Data:\r\n", b"EOF::\r\n"
 SAMPLE = np.dtype("<f8")
 MOST = 1e9
-"""Largest accepted number of samples, and of samples per second: more than any file has."""
+"""Largest accepted number of samples, and of samples per second; no file has more."""
 
 
 def read_rtx(name: str, data: bytes) -> Content:
@@ -25,7 +25,7 @@ def read_rtx(name: str, data: bytes) -> Content:
     Raises
     ------
     FileFormatError
-        It is incomplete or contradicts itself; the message has the line, or the sample.
+        The file is incomplete or contradicts itself; the message has the line, or the sample.
     """
     head, found, samples = data.partition(b"\r\n" + DATA)
     if not data.startswith(HEAD) or not found:

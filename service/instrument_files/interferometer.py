@@ -18,7 +18,7 @@ from abbe.service.instrument_files.content import read_bytes
 from abbe.service.rendering.numbers import plain, with_uncertainty
 
 NM = 1e-6
-"""mm."""
+"""One nanometre, mm."""
 WHAT_IT_IS = (
     "cyclic error of the interferometer (periodic nonlinearity), not of a drive: its period is the fringe, that of cyclic_error "
     "the lead of a screw or the pitch of an encoder"
@@ -36,7 +36,7 @@ def cyclic_error_of(path: Path, fringe_nm: float) -> CyclicError:
     Raises
     ------
     FileFormatError
-        It is no such table, or its samples do not show the cyclic error.
+        The file is no such table, or its samples do not show the cyclic error.
     """
     table = table_of(path.name, read_bytes(path), 1)
     headings = [heading.lower() for heading in table.headings(1)]

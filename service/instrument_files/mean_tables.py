@@ -18,12 +18,12 @@ _OTHER_HEAD = re.compile(r"\s*Position\s+[A-Z]", re.ASCII)
 _WAYS = {"Bidirectional": 0.0, "Forward Directional": 1.0, "Reverse Directional": -1.0, "Backward Directional": -1.0}
 _REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined", re.ASCII)
 _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", "compensation end": "end"}
-"""Words of a line of a .REN, and the field of `_Grid` that it gives."""
+"""Words with which a line of a .REN begins, and the field of `_Grid` that the line gives."""
 _UNITS = re.compile(r"(?<![A-Za-z])(millimet(?:re|er)s?|micromet(?:re|er)s?|microns?|mm|um|µm|μm|nm)(?![A-Za-z/])", re.IGNORECASE)
 NEAR = 1e-6
-"""Largest relative difference of a position of a .REN from its start, spacing and number."""
+"""Largest relative difference between a position of a .REN and the one that follows from its start, spacing and number."""
 Table = tuple[list[float], list[float], list[str], list[int]]
-"""Positions, values, words of the values, lines."""
+"""Positions, values, the values as printed, line numbers."""
 
 
 def read_pos(name: str, data: bytes) -> Content:
@@ -32,7 +32,7 @@ def read_pos(name: str, data: bytes) -> Content:
     Raises
     ------
     FileFormatError
-        It is incomplete or contradicts itself; the message has the line.
+        The file is incomplete or contradicts itself; the message has the line.
     """
     file = text_file(name, data)
     tables, said, last = _pos_tables(file)
@@ -110,7 +110,7 @@ def read_ren(name: str, data: bytes) -> Content:
     Raises
     ------
     FileFormatError
-        It is incomplete or contradicts itself; the message has the line.
+        The file is incomplete or contradicts itself; the message has the line.
     """
     file = text_file(name, data)
     said, facts, head = dict[str, str](), dict[str, float](), 0

@@ -40,9 +40,9 @@ PLATE_HEAD: Mapping[str, str] = {
     "U_per_m_mm": "0.005",
     "u_mm": "0.001",
 }
-"""What a report of a plug plate does not say: usual figures of a CMM, assumed."""
+"""Usual figures of a CMM, assumed for what a report of a plug plate does not state."""
 POINT_S = 6.0
-"""Time from point to point where a file has none, and between two poses ten times as much."""
+"""Assumed time from point to point, s, if a file states none; ten times as long between two poses."""
 NOMINAL = tuple(f"nominal_{a}_mm" for a in "xyz")
 FOUND = tuple(f"deviation_{a}_mm" for a in "xyz")
 

@@ -25,7 +25,7 @@ READERS: Mapping[str, Callable[[str, bytes], Content]] = {
     ".ren": read_ren,
     ".b5r": read_b5r,
 }
-"""Reader of each ending, in small letters: from a file's name and its bytes."""
+"""Reader of each ending (in small letters); it gets a file's name and bytes."""
 TABLES = (".csv", ".tsv", ".txt", ".xlsx", ".xlsm")
 """Endings of tables, which need a column file."""
 
@@ -64,7 +64,7 @@ def headings_of(path: Path, heading: int) -> list[str]:
     Raises
     ------
     FileFormatError
-        It is no table.
+        The file is no table.
     """
     return table_of(path.name, read_bytes(path), heading).headings(heading)
 

@@ -18,12 +18,12 @@ from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.content import HPA, AxisReadings, Content, along, axis_of, digest, step_of, text_file
 
 KINDS = {"rtl": ("linear", "length", 1e-3), "rta": ("angular", "angle", 1e-3)}
-"""File type: its owner, the quantity of its deviations, and their unit in mm or rad."""
+"""For each file type: the owner that its heading must name, the quantity of its deviations, and their unit in mm or rad."""
 ONE_WAY, BOTH_WAYS = ("0", "1", "2", "0"), ("0", "0", "2", "0")
 """First four words of ``Flags``."""
 LARGEST_MRAD = 100.0
 MOST = 20_000
-"""Largest accepted number of targets, and of runs: more than any test has."""
+"""Largest accepted number of targets, and of runs; no test has more."""
 _SECTION = re.compile(r"([A-Z][A-Z -]*)::")
 _NEEDED = ("HEADER", "TARGET DATA", "RUNS", "DEVIATIONS", "EOF")
 _READ = (*_NEEDED, "USER-TEXT", "EQUIPMENT", "ENVIRONMENT")
@@ -50,26 +50,26 @@ class _Sections:
 
     @property
     def header(self) -> _FileSection:
-        """What the file is."""
+        """The section that says what the file is."""
         return self.section("HEADER")
 
     @property
     def target_data(self) -> _FileSection:
-        """The targets."""
+        """The section of the targets."""
         return self.section("TARGET DATA")
 
     @property
     def runs(self) -> _FileSection:
-        """The number of runs."""
+        """The section with the number of runs."""
         return self.section("RUNS")
 
     @property
     def deviations(self) -> _FileSection:
-        """The readings."""
+        """The section of the readings."""
         return self.section("DEVIATIONS")
 
     def section(self, name: str) -> _FileSection:
-        """A section that every file has (`_NEEDED`)."""
+        """Return a section that every file has (`_NEEDED`)."""
         return _FileSection(self.at[name], self.lines[name])
 
 
@@ -79,7 +79,7 @@ def read_renishaw(name: str, data: bytes) -> Content:
     Raises
     ------
     FileFormatError
-        It is incomplete, contradicts itself, or holds something that is not known; the message has the line.
+        The file is incomplete, contradicts itself, or holds something unknown; the message has the line.
     """
     file = text_file(name, data)
     parts = _sections(file)
@@ -142,7 +142,7 @@ def _sections(file: TextFile) -> _Sections:
 
 
 def _facts(file: TextFile, lines: Lines) -> dict[str, str]:
-    """Names in small letters, and their values."""
+    """Return the facts of a section: names in small letters, and their values."""
     out = dict[str, str]()
     for line, text in lines:
         name, colon, value = text.partition(":")
@@ -216,7 +216,7 @@ Row = tuple[int, int, int, float]
 
 
 def _rows(parts: _Sections, targets: int, runs: int) -> tuple[list[Row], list[str]]:
-    """The deviations in order, checked against the numbers of targets and runs; and the words of their values."""
+    """Return the deviations in order, checked against the numbers of targets and runs, and their values as printed."""
     file, lines = parts.file, parts.deviations.lines
     if not lines or " ".join(lines[0][1].split()).lower() != "run target data:":
         raise file.wrong(lines[0][0] if lines else parts.deviations.at, "expected the line 'Run Target Data:'")
@@ -249,7 +249,7 @@ def _check_size(file: TextFile, rows: list[Row], quantity: str, travel: float) -
 
 
 def _readings(parts: _Sections, rows: list[Row], targets: int, *, both: bool) -> tuple[list[Row], str]:
-    """The rows that are readings, and a note on those that are not: one writer fills the way back of a one-way test with zeros."""
+    """Return the rows that are readings, and a note on the others: one writer fills the way back of a one-way test with zeros."""
     wrong = [k for k in range(0, len(rows), targets) if (rows[k][1] > 0) != (not both or (k // targets) % 2 == 0)]
     if not wrong:
         return rows, ""
@@ -264,7 +264,7 @@ def _readings(parts: _Sections, rows: list[Row], targets: int, *, both: bool) ->
 
 
 def _environment(parts: _Sections, axis: str, n: int) -> tuple[dict[str, F1], dict[str, str], list[str]]:
-    """Columns of temperature and pressure, all values as text, and notes on those that cannot be."""
+    """Return the columns of temperature and pressure, all values as text, and notes on impossible values."""
     columns, said, notes = dict[str, F1](), dict[str, str](), list[str]()
     material = list[list[float]]()
     for line, text in parts.lines.get("ENVIRONMENT", []):
