@@ -75,7 +75,8 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
 
 
 async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note) -> None:
-    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both.
+    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as `investigate` and
+    `run_guided_campaign`.
 
     A campaign that an earlier order began for this alarm goes on after its complete runs, if plan, machine and table are the same.
     """
@@ -100,7 +101,7 @@ async def _measured(
 ) -> tuple[str, list[int]]:
     """Measure the plan; return the name of its campaign and the numbers of its runs.
 
-    ``begins`` is called before anything moves, once the devices are checked. ``stopped``: a campaign to go on with, if it can be.
+    ``begins`` is called before anything moves, once the devices are checked. ``stopped``: a campaign to resume if possible.
     """
     site, store = context.site, context.store
     plan = paced(context.plan, site.max_feed_mm_min)
@@ -131,7 +132,7 @@ async def _measured(
 
 
 async def _resumed(session: Session, context: InvestigationContext, plan: CampaignPlan, name: str) -> Resumed | None:
-    """Return where a campaign goes on; None: it cannot. What was left mounted is mounted anew: nobody has watched it since."""
+    """Return where a campaign resumes; None: it cannot. Instruments left in the machine are mounted anew, since nobody has watched them."""
 
     async def untouched(_: str) -> bool:
         return False

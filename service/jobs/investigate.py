@@ -71,7 +71,7 @@ Step = Callable[[InvestigationContext, Alarm, Note], Awaitable[Alarm]]
 async def investigate(context: InvestigationContext, alarm: Alarm, note: Note, measured: Step | None = None) -> None:
     """Take an alarm as far as possible: to a proposal that waits for approval, or to the reason why there is none.
 
-    ``measured``: measures the campaign in another way than unattended.
+    ``measured``: measures the campaign in place of the unattended measurement.
 
     Raises
     ------
