@@ -21,8 +21,8 @@ SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
 class News:
     """Finds the checks and alarms that were not shown before.
 
-    Facts hold only the newest alarms. If one leaves the full list, an older alarm returns to it, which is not new. An alarm has the time at
-    which its check began, so alarms may arrive out of order.
+    Facts hold only the newest alarms. If an alarm leaves the full list, an older one returns to the list and is not new. An alarm has the
+    time at which its check began, so alarms may arrive out of order.
 
     ``since``: checks that ended before this time, and alarms of the first facts from before this time, are not new.
     """

@@ -1,4 +1,4 @@
-"""Check the OPC UA section of the machine file. Independent of asyncua, so that it works without it."""
+"""Check the OPC UA section of the machine file. This module does not need asyncua."""
 
 from __future__ import annotations
 

@@ -71,7 +71,7 @@ async def add_types(server: Server, index: int, variables: Iterable[tuple[str, u
     Raises
     ------
     NodesetBroken
-        A companion specification cannot be read; the server is not to be used then.
+        A companion specification cannot be read; the server must not be used.
     """
     nodes = server.nodes
     machine, event, parent = nodes.base_object_type, nodes.base_event_type, nodes.objects.nodeid
