@@ -372,8 +372,8 @@ class Capabilities:
     """The controller itself refuses an activation while the machine moves or an interlock is open."""
     lease: bool = False
     can_disable: bool = False
-    """With one table only (`abbe.drivers.api.OneBank`), proved by ``abbe comp commission --one-bank``: the control refuses writes while the
-    table acts, and a switch with a wrong CRC; switched off, it says so."""
+    """With one table only (`abbe.drivers.api.OneBank`), proved by ``abbe comp commission --one-bank``: the control refuses writes while
+    the table acts, and a switch with a wrong CRC; it reports that a table is switched off."""
 
     @property
     def level(self) -> int:
