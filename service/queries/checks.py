@@ -57,7 +57,7 @@ def latest_checks(reader: Reader, limit: int) -> list[Verification]:
 
 
 def last_good(found: Sequence[Verification], recipe: str) -> Verification | None:
-    """The first of some checks, newest first, of a recipe that passed and did not verify a push; None: there is none."""
+    """Return the newest of some checks that is of this recipe, passed, and did not verify a push; None: there is none."""
     return next((check for check in found if check.verdict == "pass" and check.recipe == recipe and not check.push), None)
 
 

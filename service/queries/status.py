@@ -44,9 +44,9 @@ class AlarmWork:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmSummary(AlarmHead):
-    """An alarm for people: if it is over, ``signals`` are those that raised it.
+    """An alarm for people. If the alarm is over, ``signals`` are those that raised it.
 
-    ``priority``: as of `Alarm`; ``outcome``: latest result of the work on it.
+    ``priority``: as in `Alarm`; ``outcome``: latest result of the work on the alarm.
     """
 
     alarm: int
@@ -57,7 +57,7 @@ class AlarmSummary(AlarmHead):
     proposal: int | None = None
 
     def is_shelved(self, now: datetime) -> bool:
-        """Whether a person shelved it until a later time than ``now``."""
+        """Whether a person shelved the alarm until a later time than ``now``."""
         return self.shelved_until_utc is not None and self.shelved_until_utc > now
 
 
