@@ -137,7 +137,7 @@ def _point(kind: PahkType, point: VectorCase, checks: Checks) -> None:
 
 
 def read_random(case: VectorCase, checks: Checks) -> None:
-    """Compare RX, RY, RZ of every case, in the coverage of the inputs."""
+    """Compare RX, RY, RZ of every case, at the coverage factor of the inputs."""
     for name, part in case.at("types").items():
         for point in part.parts():
             axes, probe, given = point.array("X", shape=(3,))[None], point.array("probe", shape=(3,)), point.at("R")
