@@ -1,4 +1,5 @@
-"""The figures of a report in the Q-DAS ASCII transfer format (AQDEF, .dfq): one characteristic for each, as statistics programs read it."""
+"""The figures of a report in the Q-DAS ASCII transfer format (AQDEF, .dfq): each figure is one characteristic, as statistics programs
+read it."""
 
 from __future__ import annotations
 
@@ -21,7 +22,7 @@ def document_dfq(document: Document) -> bytes:
     Raises
     ------
     FileFormatError
-        There is no figure.
+        The report has no figure.
     """
     if not document.figures:
         raise FileFormatError("AQDEF holds figures; this report has none", "give a campaign with results")

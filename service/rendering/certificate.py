@@ -69,7 +69,7 @@ def document_dcc(document: Document) -> str:
 
 
 def _tag(name: str, *inside: ET.Element | str | None, kind: str = "") -> ET.Element:
-    """An element of the DCC (or ``si:``); None inside counts as nothing; ``kind``: its refType."""
+    """Return an element of the DCC (or ``si:``); parts of ``inside`` that are None are left out; ``kind``: its refType."""
     out = ET.Element(name if ":" in name else f"dcc:{name}", {"refType": kind} if kind else {})
     for one in inside:
         if isinstance(one, str):
@@ -198,7 +198,7 @@ def _real(value: float, u: float | None, figure: ReportFigure) -> ET.Element:
 
 
 def _conformity(document: Document, figure: ReportFigure) -> ET.Element:
-    """Conformity by the decision rule. Where the measurement cannot tell, it is conditional on the side of the value."""
+    """Return the conformity by the decision rule. If the measurement cannot decide, conformity is conditional, by the value alone."""
     assert figure.value is not None
     assert figure.limit is not None
     inside = "conditionalPass" if abs(figure.value) <= figure.limit else "conditionalFail"

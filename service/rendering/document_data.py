@@ -158,7 +158,8 @@ def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any
 
 
 def _told(lang: str, value: Any, key: str = "", head: Any = None) -> Any:
-    """Texts translated into a language, except those of pictures, which are translated when drawn. ``head``: of a table with these rows."""
+    """Texts translated into a language, except those of pictures, which are translated when drawn. ``head``: headings of the table that
+    has ``value`` as its rows."""
     if lang == ENGLISH or key in {"kind", "sign", "layout", "lang", "format", "svgs", "number"}:
         return value
     if key == "facts":

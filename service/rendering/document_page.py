@@ -28,7 +28,7 @@ from abbe.service.rendering.qif import document_qif
 
 _MARKS = {"ok": "✔", "open": "◐", "bad": "✖"}
 FONT = "Libertinus Serif"
-"""Bundled with the typesetter, so that a report looks the same on every computer."""
+"""The font comes with the typesetter, so that a report looks the same on every computer."""
 
 
 FONTS_OF = {

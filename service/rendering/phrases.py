@@ -1,9 +1,9 @@
 """Translate English sentences (stored verdicts and remarks, reports, pictures) to the reader's language.
 
-A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the braces
-is translated by the same rules; that of `NAMED` is not. It never contains the end of a sentence; if its name has one letter, it contains
-no blanks. A phrase has no full stop at its end. A text without a pattern is split into sentences and their parts, and each part is tried; a
-part without a pattern stays English. Tests search all screens and reports for texts without a pattern.
+A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". A text that stands
+for a name in braces is translated by the same rules, unless `NAMED` has this name. Such a text never contains the end of a sentence, and
+no blanks if its name has one letter. A phrase has no full stop at its end. A text without a pattern is split into sentences and their
+parts, and each part is tried; a part without a pattern stays English. Tests search all screens and reports for texts without a pattern.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LANGUAGES = (ENGLISH, "de", "ja", "ko")
 LONGEST = 2000
 """Longer texts are no sentences."""
 NAMED = frozenset(("campaign", "file", "machine", "run", "setup", "who"))
-"""Places that hold names which people gave, without a semicolon."""
+"""Names in braces that stand for names given by people; their texts contain no semicolon."""
 _PLACE = re.compile(r"\{(\w+)\}")
 _SHOWN = re.compile(r'>([^<>]+)<|aria-label="([^"]*)"')
 _WORD = re.compile("[A-Za-z]{2}|/")
@@ -38,7 +38,8 @@ _OWN_ENDS = {
 
 @dataclass(frozen=True, slots=True)
 class _Pattern:
-    """A phrase with places: its text before the first and after the last, both as one expression, and the phrase in the language."""
+    """A phrase with places: its text before the first place and after the last, an expression that fits the whole phrase, and the
+    translation."""
 
     head: str
     tail: str
@@ -105,7 +106,7 @@ def _fitting(lang: str, text: str) -> str | None:
 
 
 def _within_a_sentence(lang: str, text: str) -> str | None:
-    """A phrase with a small first letter that begins a sentence here."""
+    """Translate a text that begins a sentence but whose phrase begins with a small letter; None without such a phrase."""
     said = _fitting(lang, text[:1].lower() + text[1:]) if text[:1].isupper() else None
     return None if said is None else said[:1].upper() + said[1:]
 

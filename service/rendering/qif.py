@@ -30,7 +30,7 @@ def document_qif(document: Document) -> str:
     Raises
     ------
     FileFormatError
-        There is no figure.
+        The report has no figure.
     """
     if not document.figures:
         raise FileFormatError("QIF holds figures; this report has none", "give a campaign with results")
