@@ -19,7 +19,7 @@ from abbe.service.verification.iso_report import Evaluated
 
 NODES = 9
 MOST = 3
-"""Pictures of planes at most."""
+"""Largest number of pictures of planes."""
 
 
 def artefact_sections(joint: JointSolution) -> list[Section]:
@@ -35,7 +35,7 @@ def artefact_sections(joint: JointSolution) -> list[Section]:
 
 
 def _planes(joint: JointSolution, box_mm: F2) -> list[tuple[SlicePlane, str]]:
-    """The plane of a flat box, or the planes through the middle of another one, with their position as text."""
+    """Return the plane of a flat box, or the planes through the middle of any other box, with their position as text."""
     out = []
     for plane, (across, up, fixed) in PLANES.items():
         if min(np.ptp(box_mm[across]), np.ptp(box_mm[up])) <= 0.0:

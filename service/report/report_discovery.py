@@ -300,7 +300,7 @@ def _traces(found: _Found) -> list[ResidualTrace]:
 def _place(found: _Found, a: int, b: int) -> PlaceMap | None:
     """Return a map over axes ``a`` and ``b``: in each cell the rms of measured minus simulated, divided by the noise.
 
-    None if no reading lies there, or all at one place.
+    None if there are no readings, or all lie at one place.
     """
     points, ratio = _points(found)
     if not len(points):
