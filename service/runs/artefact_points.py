@@ -16,7 +16,7 @@ from abbe.service.domain.run import FEATURE, ArtefactSetup, Run
 from abbe.service.errors import MeasurementFault
 
 FEWEST = 3
-"""Sensed components that a run needs at least."""
+"""Smallest number of sensed components of a run."""
 POLE = 1.5
 """A ball's height comes from one touch and its radius, the other directions from two touches: variance larger by this share."""
 EXACT = 1e4

@@ -143,7 +143,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
 
 
 def _check_documents(record: RunRecord) -> None:
-    """Raise KeyError if an entry is missing without which readings would differ: set-up, machine, clock, rate or start of a path."""
+    """Raise KeyError if an entry is missing on which readings depend: set-up, machine, clock, rate or start of a path."""
     for key in ("machine", "setup", "ctrl0_us", *(("rate_hz",) if record.start_doc.get("path") else ())):
         record.start_doc[key]
     if record.end.path_end_us and record.end.path_start_us is None:

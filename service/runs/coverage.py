@@ -3,8 +3,8 @@
 A run gives no result if it was stopped, aborted, interrupted or failed, or has read less than `LEAST` of its path. A complete run with a
 few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
 
-Also the range of positions of runs (beyond it a map is assumed), and axis and angle of a ball-bar path, to count turns here and to draw
-them in pages and the live view.
+The module also gives the range of positions of runs (beyond it a map is assumed), and axis and angle of a ball-bar path: coverage counts
+its turns, pages and the live view draw it.
 """
 
 from __future__ import annotations

@@ -4,9 +4,9 @@ For a ball-bar in motion, the controller's "path running" output (the sync line)
 the reading. The first sample with this input set was taken within one period after the path began. No reading is placed by the arrival time
 of its sample.
 
-The two edges of the sync line tie the box's clock to the controller's (`run_clock`). The device stamps and arrival times of both devices'
-messages are an independent check by way of this computer's clock, and a disagreement is reported. If they give the ratio of the two clock
-rates with less uncertainty than the edges, it is taken from them.
+The two edges of the sync line tie the box's clock to the controller's (`run_clock`). The device stamps and arrival times of both
+devices' messages are an independent check by way of this computer's clock, and a disagreement is reported. If the stamps give the ratio
+of the two clock rates with less uncertainty than the edges, the stamps are used.
 """
 
 from __future__ import annotations
@@ -139,7 +139,7 @@ BarSamples = npt.NDArray[np.void]
 
 
 def _holds(samples: BarSamples, what: Callable[[int], bool]) -> npt.NDArray[np.bool_]:
-    """Mask of the samples for whose status something holds; a run has few different ones."""
+    """Return the mask of the samples whose status fulfils ``what``, which is called once for each different status."""
     status = np.ascontiguousarray(samples["status"])
     holds = np.zeros(2**16, dtype=np.bool_)
     for kind in np.flatnonzero(np.bincount(status)):

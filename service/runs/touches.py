@@ -56,7 +56,7 @@ def _free(sides: F2) -> F2:
 
 
 def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> float:
-    """Of the mean of two opposite sides; each resolution is a rectangle (JCGM 100, F.2.2.1)."""
+    """Return the repeatability of the mean of two opposite sides; each resolution is a rectangular distribution (JCGM 100, F.2.2.1)."""
     return max(float(np.hypot(spread_mm / np.sqrt(2.0 * repeats), resolution_mm / np.sqrt(24.0))), LEAST_U_MM)
 
 
