@@ -221,12 +221,12 @@ class AlarmManager(RetryingStore):
         return "" if one.active else f"alarm {number} is over: the last check passed, and there is no cause to look for"
 
     async def ordered(self, number: int, by: str, look: Investigate, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Investigate an alarm because the user ``by`` asked for it: after its last line, or anew if it had an answer.
+        """Investigate an alarm because the user ``by`` asked for it: resume after its last line, or start anew if it has an answer.
 
         Raises
         ------
         Exception
-            As `look` does; a line of the alarm tells it, unless another process has the machine.
+            As `look` raises; a line of the alarm records the error, unless another process has the machine.
         """
         alarm = await self.note(number, AlarmKind.ORDERED, AlarmFacts(name=by, text=f"{by} has started the search for the cause"))
         terms = Schedule(f"investigation of alarm {number}", "", "UTC", self.duties.campaign)

@@ -1,4 +1,4 @@
-"""Waiting slots, and outcomes of slots without a normal run: state (at most 30 characters), code of the alarm, sentence for both.
+"""Waiting slots, and outcomes of slots without a normal run: state (at most 30 characters), code of the alarm, and a sentence for people.
 
 The job writes ``done: <verdict>``; ``interrupted`` is also written when the service is stopped. All others are made here:
 ``missed: <how> late`` (moving a machine hours after the planned time would surprise anyone next to it), ``skipped: busy``,
@@ -59,7 +59,7 @@ def not_ready(text: str) -> Hindrance:
 
 
 class SlotOutcome(NamedTuple):
-    """Outcome of a slot: state for the ledger, code of the alarm, and a sentence for both."""
+    """Outcome of a slot: state for the ledger, code of the alarm, and a sentence for ledger and alarm."""
 
     state: str
     code: str
