@@ -208,7 +208,7 @@ class Control:
     # ---- requests of a person -------------------------------------------------------------------------------------
 
     def pause(self) -> None:
-        """Pause at the next safe place: between points at once; a recorded path is stopped, and its rest or all of it measured later."""
+        """Pause at the next safe place: between points at once; a recorded path stops, and its rest or the whole path is measured later."""
         if not (self._stop or self._abort or self._pause or self.no_pause_reason):
             self._pause = True
             self._to(State.PAUSING)

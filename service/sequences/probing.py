@@ -27,7 +27,8 @@ RADIUS_MM = 0.05
 MOVED_MM = 0.01
 """Allowed change of a feature that is touched again: it covers minutes of drift, not a plate that has slipped."""
 QUALIFIED_MM, COVERAGE = 0.002, 2.0
-"""Allowed change of the radius that the first feature shows when it is touched again, beyond the uncertainty of both (k = 2): warming."""
+"""Allowed change, by warming, of the first feature's radius when it is touched again, beyond the uncertainty of both radii; coverage
+factor of that uncertainty."""
 TOUCH_S = 30.0
 RESEAT_S, POLL_S = 1.0, 0.02
 """How long a stylus may take to come back to rest after a touch (receivers report it late), and how often this is asked."""
@@ -81,7 +82,7 @@ class FeatureTouch:
     _period_s: float = 0.0
 
     async def run(self) -> dict[str, Any] | None:
-        """Return the record of the feature (`abbe.service.runs.touches`) without its time; None: it was left, as asked.
+        """Return the record of the feature (`abbe.service.runs.touches`) without its time; None: the feature was left on request.
 
         Raises
         ------
@@ -231,8 +232,8 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
     Raises
     ------
     SetupDisturbed
-        Its radius has changed by more than `QUALIFIED_MM` and its uncertainty, so the stylus is no longer as it was qualified; or it has
-        moved.
+        The feature has moved; or its radius has changed by more than `QUALIFIED_MM` and its uncertainty, so the stylus is no longer as
+        qualified.
     """
     before = next((one for one in earlier if one.feature == touched.feature), None)
     if before is None:

@@ -319,8 +319,8 @@ class Runner:
         return {}
 
     async def _touched(self, step: TouchFeature, watch: Watch) -> dict[str, Any]:
-        """Touch a feature; its time is that of the end, its temperature the air's if a laser stands by. After a pause it begins anew, and
-        the first feature is touched before it: who paused may have touched stylus or artefact.
+        """Touch a feature. Its time is the end of the touches, its temperature that of the air if there is a laser. After a pause, which
+        a person may have used to touch stylus or artefact, first touch the first feature, then begin this one anew.
         """
         record = None
         while record is None:

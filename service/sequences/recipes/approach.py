@@ -1,4 +1,5 @@
-"""Shared by all recipes: fields with their limits, the controller's grid, approach positions, and a ball-bar's way to its path's start.
+"""Parts that all recipes share: fields with their limits, the controller's grid, approach positions, and the ball-bar's way to a path's
+start.
 
 Programs and files (`abbe.service.sequences.recipes.recipe_file`) make the same recipe objects. The limits in the annotations apply to
 files; programs may exceed them, as tests do.

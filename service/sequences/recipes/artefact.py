@@ -35,10 +35,10 @@ Millimetres = Annotated[float, Limits(gt=0.0, le=500.0)]
 class ArtefactTest(TestRecipe):
     """The features of an artefact in one pose.
 
-    ``artefact``: its name under ``[artefact]`` of the file; ``origin_mm``: axis position at which the stylus tip is at its zero;
-    ``rotation_deg``: its turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified. ``depth_mm``: of the touches in a
-    hole below its nominal place; ``clear_mm``: height above the features at which the way is free. ``turned_every``: every so many features
-    the first touch is at 45 degrees instead of 0, which shows the lobing; 0: never.
+    ``artefact``: its name under ``[artefact]`` of the file; ``origin_mm``: axis position at which the stylus tip is at the artefact's
+    zero; ``rotation_deg``: the artefact's turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified. ``depth_mm``:
+    of the touches in a hole below its nominal place; ``clear_mm``: height above the features at which the way is free. ``turned_every``:
+    every so many features the first touch is at 45 degrees instead of 0, which shows the lobing; 0: never.
     """
 
     artefact: Name

@@ -60,7 +60,7 @@ def identification(machine: Machine, *, rate_hz: int = 100, name: str = "identif
 
 
 def _with_judge(fitted: Helix | Diagonal, judge: Helix | Diagonal) -> list[Recipe]:
-    """Return a test and, in the same mounting, the one that only judges."""
+    """Return a test and a second one in the same mounting, which only judges the solution."""
     return [replace(fitted, unmount=False), replace(judge, label=f"judge-{fitted.label}", role="holdout", mount=False)]
 
 
