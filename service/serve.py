@@ -329,7 +329,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
 
 
 def _admins(url: str) -> int:
-    """Return how many admins may log in. A database that does not exist has none, and this does not create it."""
+    """Return how many admins may log in. A database that does not exist has none, and is not created."""
     parsed = parse_url(url)
     if parsed.drivername == "sqlite" and not Path(parsed.database or "").is_file():
         return 0
