@@ -24,9 +24,9 @@ class Site:
 
     ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``; one without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
-    stated temperature of the scales by axis. ``room_c``: range of the air by the room's own thermometer, which a person states for a
-    machine without a laser until the day ``room`` of ``calibrated_until``. ``control``: identity of the control (`control_of`); empty
-    without a control.
+    stated temperature of the scales by axis. ``room_c``: range of the air temperature that a person states for a machine without a
+    laser, by the room's own thermometer; valid until the day ``room`` of ``calibrated_until``. ``control``: identity of the control
+    (`control_of`); empty without a control.
     """
 
     name: str
