@@ -145,5 +145,5 @@ class People(Repository):
 
 
 def _ended(now: str) -> Update:
-    """Statement that ends open sessions; the caller adds which."""
+    """Return the statement that ends open sessions; the caller adds the condition."""
     return update(sessions).where(sessions.c.ended_utc.is_(None)).values(ended_utc=now)

@@ -226,8 +226,8 @@ class Models(Repository):
 def _add_version(connection: Connection, model: NewVersion, discovery_id: int | None, now: str) -> int:
     """Compare and swap: append the version only if its base is the current one.
 
-    SQLite has one writer at a time, so the SELECT decides. On PostgreSQL two may read at once; the second one to insert the number waits
-    for the first and violates the constraint.
+    SQLite has one writer at a time, so the SELECT decides. On PostgreSQL two processes may read at once; the second one to insert the
+    number waits for the first and violates the constraint.
     """
     table = machine_models.c
     last = connection.execute(select(func.max(table.version)).where(table.machine == model.machine)).scalar()

@@ -1,4 +1,4 @@
-"""The first schema, with tables of its own: those of the program have changed since (decision 0033)."""
+"""The first schema. It defines its own tables, because those of the program have changed since (decision 0033)."""
 
 from __future__ import annotations
 
