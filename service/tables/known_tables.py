@@ -54,7 +54,7 @@ class Endorsement:
 
     @property
     def not_here(self) -> str:
-        """Return why the table is not accepted on another machine: it was verified or accepted only on its own."""
+        """Return why the table is not accepted on another machine: it was verified or accepted only on the machine of this endorsement."""
         push = f" (push {self.push})" if self.push and self.how == "verified" else ""
         return f"{self.how} on machine {self.machine!r}{push}, not on this one"
 
