@@ -33,7 +33,7 @@ class LoginOrigin:
 
 @dataclass(frozen=True, slots=True)
 class _Rule:
-    """Which count an attempt belongs to (account and place), the number of failures without a wait, and the longest wait."""
+    """The count that an attempt belongs to (account and place), the number of failures without a wait, and the longest wait."""
 
     key: tuple[str, str]
     free: int = FREE

@@ -231,7 +231,7 @@ class UserAccounts:
     def check_pin(self, name: str, pin: str) -> tuple[UserRecord | None, bool]:
         """The user, if the PIN matches, the role may use one and the user is enabled, else None; and whether this try removed the PIN.
 
-        `MOST_WRONG_PINS` wrong ones in a row remove it.
+        `MOST_WRONG_PINS` wrong tries in a row remove the PIN.
         """
         user = self._store.people.find(name) if NAME.fullmatch(name) else None
         if user is None or not _may_use_pin(user):
