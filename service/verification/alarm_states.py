@@ -194,7 +194,8 @@ def step_of_order(alarm: Alarm) -> AlarmKind:
 def step_alone(alarm: Alarm) -> AlarmKind | None:
     """Next step that the service does without a person, as `next_step`.
 
-    Once a person has ordered the search, only an order measures: she agreed to be at the machine, not that it starts alone later.
+    Once a person has ordered the search, only another order starts a measurement: the person agreed to be at the machine then, not to a
+    later start.
     """
     step = next_step(alarm)
     return None if step is AlarmKind.MEASURED and alarm.last(AlarmKind.ORDERED) is not None else step

@@ -121,7 +121,8 @@ def _feed(mm_min: float) -> str:
 
 
 def remarks(loaded: Sequence[LoadedRun], feed: Callable[[float], str] = _feed) -> list[str]:
-    """How places, tables in force, directions and feeds differ from those of the first run. ``feed`` formats mm/min with its unit."""
+    """Return remarks on places, tables in force, directions and feeds that differ from those of the first run. ``feed`` formats mm/min
+    with its unit."""
     out = []
     first = loaded[0]
     for other in loaded[1:]:
@@ -182,7 +183,7 @@ def _laser(one: LoadedRun) -> ComparedCurve:
 
 
 def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | None:
-    """Second minus first at the places of the first that both runs read; None for fewer than three."""
+    """Return the second run minus the first at those places of the first that both runs read; None for fewer than three places."""
     far = NEAR_RAD if first.round else 0.05
     distance, at = scipy.spatial.cKDTree(second.place).query(first.place)
     near = distance <= far

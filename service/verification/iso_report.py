@@ -147,7 +147,7 @@ def _tell(out: Evaluated, test: str, reduction: Reduction) -> None:
 
 
 def _short(way: Way) -> str:
-    """How a picture's title names a way; empty for a test that is not reduced."""
+    """Return the name of a way in a picture's title; empty for a test that is not reduced."""
     return way.method.partition(", ")[2] and f" {way.method.partition(', ')[2]}"
 
 
@@ -187,7 +187,7 @@ def _positioning(label: str, x_label: str, p: Positioning) -> PictureBlock:
 def _diagonals(
     out: Evaluated, plane: str, tests: list[AxisTest], stated: tuple[ScaleBudget, StatedInputs], reductions: Mapping[str, Reduction]
 ) -> None:
-    """Add the figures of diagonals, by ``reductions`` of each by name: all of them are reduced, or none."""
+    """Add the figures of diagonals; ``reductions``: the reduction of each by its name. All of them are reduced, or none."""
     what = "Body diagonals" if plane == "body" else f"Face diagonals {plane}"
     for name, one in reductions.items():
         _tell(out, f"{DIAGONAL_AT_20}, diagonal {name}", one)

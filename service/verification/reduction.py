@@ -1,4 +1,5 @@
-"""From which temperature a test of an axis or a diagonal is reduced to 20 °C, by the runs' sensors and the machine file, or why not."""
+"""Reduction of a test of an axis or a diagonal to 20 °C: temperature and coefficients, by the runs' sensors and the machine file, or why
+not."""
 
 from __future__ import annotations
 
@@ -20,7 +21,7 @@ from abbe.service.rendering.numbers import plain, tidy, with_uncertainty
 
 PER_UM = 1e6
 AIR_APART_K = 2.0
-"""By how much air and scale may differ before the report says so."""
+"""Largest difference between air and scale, K, that needs no remark in the report."""
 AT_20, DIAGONAL_AT_20 = "ISO 230-2 at 20 °C", "ISO 230-6 at 20 °C"
 """Prefix of the condition that states how a test was reduced."""
 REDUCTION_STATEMENT = (
@@ -120,7 +121,7 @@ def _column(axis: str) -> str:
 
 
 def _out_of_bounds(runs: Sequence[Run], axis: str) -> str:
-    """Which recorded temperature of an axis' scale is beyond the bounds of a stated one; empty if none is."""
+    """Return the recorded temperature of an axis' scale that exceeds the bounds of a stated one; empty if none does."""
     for run in runs:
         values = _recorded(run, _column(axis))
         beyond = values[(values < COLDEST_C) | (values > WARMEST_C)]
@@ -130,7 +131,7 @@ def _out_of_bounds(runs: Sequence[Run], axis: str) -> str:
 
 
 def _notes(runs: Sequence[Run], axis: str, at: ScaleTemperature | None, material: AxisMaterial | None) -> tuple[str, ...]:
-    """Remarks on a temperature that is not from the sensors: sensors of some runs only, air that is far from it."""
+    """Remarks on a temperature that is not from the sensors: only some runs have a sensor, or the air differs much."""
     out = []
     having = sum(1 for run in runs if _recorded(run, _column(axis)).size)
     if 0 < having < len(runs):
