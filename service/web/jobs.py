@@ -55,7 +55,8 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     ) -> Response:
         """Run a recipe now; ``identification``, the full campaign, ends with a proposal and also needs the permission ``propose``.
 
-        With ``alarm`` the full campaign also looks for the cause of that alarm: after its last finished step or, after an answer, anew.
+        With ``alarm`` the full campaign also looks for the cause of that alarm: it resumes after the last finished step or, if there is
+        an answer, starts anew.
         """
         visit: Visit = request.state.visit
         recipe = named(wanted.recipe, wanted.rate_hz)

@@ -38,7 +38,7 @@ SCREENS = {
 def step_address(step: PathStep, to_do_for: int | None = None) -> str:
     """Address of the result of a step, empty if there is none yet.
 
-    ``to_do_for``: an alarm; then of the screen on which a person does the step.
+    With the alarm ``to_do_for``: address of the screen on which a person does the step.
     """
     if to_do_for is not None and step.key in {"cause", "proposal"}:
         return search_address(to_do_for)

@@ -157,7 +157,7 @@ class CoreLine:
     # ---- requests to the core ---------------------------------------------------------------------------------------
 
     async def start(self, recipe: str, key: str, who: str, alarm: int = 0) -> Answer:
-        """Start a job; ``alarm``: a full campaign looks for its cause. Raises CoreUnavailable if no answer comes.
+        """Start a job; ``alarm``: the alarm whose cause a full campaign looks for. Raises CoreUnavailable if no answer comes.
 
         Then the outcome is unknown: repeat the request with the same key.
         """

@@ -97,7 +97,7 @@ async def _stop_csrf(auth: Authenticator, request: Request) -> str:
 async def identified(auth: Authenticator, origin: LoginOrigin, name: str, secret: str) -> tuple[UserRecord | None, float, bool]:
     """Return the user with this name and password (or PIN), or None; seconds until the next try; whether the password was checked at all.
 
-    It is not checked after too many wrong tries. The audit records the removal of a PIN.
+    The password is not checked after too many wrong tries. The audit records the removal of a PIN.
     """
     wait_s = auth.lockout.wait_s(name, origin)
     if wait_s > 0:

@@ -65,7 +65,7 @@ def add_alarm_pages(app: FastAPI, context: PageContext) -> None:
 
 
 def _order(one: AlarmSummary, shelved: bool) -> tuple[bool, int, int, int]:
-    """Shelved ones last; unseen and active ones first, by priority, then the newest."""
+    """Return the sort key of an alarm: shelved ones last; unseen and active ones first, by priority, then the newest."""
     return shelved, {"raised": 0, "cleared": 1}.get(one.state, 2), one.priority, -one.alarm
 
 

@@ -73,7 +73,7 @@ _ACCOUNT = re.compile(r"os:(?P<name>[^@]*)@(?P<host>.*)|token:(?P<owner>[^/]*)/(
 
 @dataclass(frozen=True, slots=True)
 class Deed:
-    """One record in the reader's language. ``sign``: of its end, as in `abbe.service.web.pages.proposals.sign`."""
+    """One record in the reader's language. ``sign``: sign of its outcome, as in `abbe.service.web.pages.proposals.sign`."""
 
     record: AuditEntry
     who: str

@@ -100,8 +100,8 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
 def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
     """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970.
 
-    ``value``, ``u``: as text, rounded together, between spaces; ``bare``: places and values of the points without U, which nothing rounds.
-    Columns of the chart have a place for each point, None where it has none.
+    ``value``, ``u``: as text, rounded together, between spaces; ``bare``: indices and values of the points without U. Columns
+    of the chart have one entry for each point, None without a value.
     """
     frame = current()
     name, unit = language.figure(frame.lang, chart.figure)
@@ -157,7 +157,7 @@ def _short(value: float, digits: int = 6) -> float | None:
 
 
 def _column(values: F1, at: Sequence[int | None]) -> list[float | None]:
-    """Values of a chart in the places of the points, to the digits that a screen can show."""
+    """Values of a chart, one for each point, rounded to the digits that a screen can show."""
     return [None if k is None else _short(values[k], 4) for k in at]
 
 

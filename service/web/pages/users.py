@@ -1,4 +1,5 @@
-"""Users on the page: an admin adds, disables and changes them; each person has an own password and PIN. The functions are `abbe user`'s."""
+"""Users on the page: an admin adds, disables and changes users; each person changes the own password and PIN. `abbe user` calls the same
+functions."""
 
 from __future__ import annotations
 
