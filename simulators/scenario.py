@@ -130,6 +130,14 @@ class ProbeConfig:
 
 
 @dataclass(frozen=True, slots=True)
+class SphereConfig:
+    """A qualification sphere fixed on the table: axis position at which the stylus tip is at its centre; radius 0: there is none."""
+
+    centre_mm: Triple = (0.0, 0.0, 0.0)
+    radius_mm: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class Scenario:
     """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit.
 
@@ -148,6 +156,7 @@ class Scenario:
     hidden: HiddenConfig = field(default_factory=HiddenConfig)
     artefact: ArtefactConfig = field(default_factory=ArtefactConfig)
     probe: ProbeConfig = field(default_factory=ProbeConfig)
+    sphere: SphereConfig = field(default_factory=SphereConfig)
 
 
 def load(path: Path = DEFAULT_PATH) -> Scenario:

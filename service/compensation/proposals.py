@@ -249,12 +249,12 @@ async def make(  # noqa: PLR0913 - every one of them is a choice of the caller, 
     candidate = candidate_of(site, promise, base, known.campaign.runs, form)
     context = await candidate_context(site, store, base, form, proposal.tables, clock)
     status, stated = base.status, [STATED] if air_is_stated(site, known.campaign.runs) else []
+    held = "; ".join(filter(None, [proposal.solved.holds_at, *stated]))
     proposed = Proposed(
         site.doc, name, solution_id, candidate, proposal.tables.u_mm,
         BaseMark(base.image, status.active_bank, status.gen, status.boot_id), secrets.randbits(31), site.limits, site.two_people,
         by or login(), utc_text(clock.utc()), tuple(reasons_against(candidate, context, site.limits)),
-        (*known.lines, *proposal.left_out, *stated),
-        proposal.solved.holds_at,
+        (*known.lines, *proposal.left_out), held,
     )  # fmt: skip
     plain = doc_of(proposed)
     number = await store.write(store.proposals.add, site.name, solution_id, plain, digest_of_doc(plain))

@@ -26,6 +26,11 @@ def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, P
     return matrix
 
 
+def touched_name(feature: str, *, qualifies: bool) -> str:
+    """Name what is touched, for people: a feature, or the qualification sphere."""
+    return f"{'qualification sphere' if qualifies else 'feature'} {feature}"
+
+
 class PoseObject(FileObject):
     """Stated pose of an artefact: axis position = origin + matrix times nominal place."""
 
@@ -54,8 +59,32 @@ class CalibratedLength(FileObject):
     temperature_C: float = 20.0  # noqa: N815
 
 
+class Obstacle(FileObject):
+    """A box beside the features that the probe must not meet, such as a clamp or a wall: two corners in the artefact's axes."""
+
+    id: Name
+    low_mm: Point
+    high_mm: Point
+
+    @model_validator(mode="after")
+    def _a_box(self) -> Self:
+        if any(low >= high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
+            raise ValueError(f"obstacle {self.id}: every coordinate of low_mm must be below that of high_mm")
+        return self
+
+
+class QualificationSphere(FileObject):
+    """A sphere that is fixed on the table: axis position at which the stylus tip is at its centre, and its radius with U = k u."""
+
+    id: Name
+    centre_mm: Point
+    radius_mm: float = Field(gt=0.0)
+    U_mm: float = Field(ge=0.0)
+    k: float = Field(2.0, gt=0.0)
+
+
 class ArtefactObject(FileObject):
-    """A plate, bar or workpiece with its features and known lengths."""
+    """A plate, bar or workpiece with its features and known lengths; ``obstacles``: what else lies there."""
 
     kind: str
     features: list[Feature]
@@ -63,6 +92,7 @@ class ArtefactObject(FileObject):
     u_expansion_per_K: float = 1e-6  # noqa: N815
     reference_temperature_C: float = 20.0  # noqa: N815
     calibrated_lengths: list[CalibratedLength] = Field(default_factory=list)
+    obstacles: list[Obstacle] = Field(default_factory=list)
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -78,7 +108,11 @@ class ArtefactObject(FileObject):
 
 
 class ArtefactSetupObject(FileObject):
-    """Position of the artefact, and the sensor that found its points."""
+    """Position of the artefact, and the sensor that found its points.
+
+    ``tool_radius_mm``: of cutter or stylus, as stated or as a qualification sphere showed it; then ``u_tool_radius_mm`` is its standard
+    uncertainty.
+    """
 
     setup_id: str
     t_set_s: float
@@ -87,6 +121,7 @@ class ArtefactSetupObject(FileObject):
     tool_mm: Point
     pose: PoseObject
     tool_radius_mm: float | None = Field(None, gt=0.0)
+    u_tool_radius_mm: float | None = Field(None, ge=0.0)
 
 
 Numbers = list[float]

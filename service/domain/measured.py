@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
+from abbe.service.domain.artefact import touched_name
 from abbe.service.domain.document import Doc, DocumentRow, HistoryRow, record
 from abbe.service.errors import StoreError
 
@@ -126,7 +127,8 @@ class TouchedFeature:
 
     ``nominal_mm``: in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from the centre to each
     touch, machine axes; ``touches_mm``: for each side the repeated latched axis positions; ``start_deg``: direction of the first touch;
-    ``resolution_mm``: travel between two readings of the probe input by the control, 0: none.
+    ``resolution_mm``: travel between two readings of the probe input by the control, 0: none; ``radius_mm``: distance of the tip's centre
+    from it that was expected; ``u_sphere_mm``: standard uncertainty of the radius of a qualification sphere, None: a feature.
     """
 
     feature: str
@@ -139,6 +141,18 @@ class TouchedFeature:
     feed_mm_min: float = 0.0
     false_trips: int = 0
     resolution_mm: float = 0.0
+    radius_mm: float | None = None
+    u_sphere_mm: float | None = None
+
+    @property
+    def qualifies(self) -> bool:
+        """Whether it is the qualification sphere."""
+        return self.u_sphere_mm is not None
+
+    @property
+    def what(self) -> str:
+        """What it is, for people."""
+        return touched_name(self.feature, qualifies=self.qualifies)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

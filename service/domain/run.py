@@ -187,6 +187,10 @@ class Setup:
         """The same set-up with this time of mounting, s."""
         return replace(self, t_set_s=t_set_s, document=self.document | {"t_set_s": t_set_s})
 
+    def noted(self, **facts: Any) -> Self:
+        """The same set-up with these keys of its document, which have no field."""
+        return replace(self, document=self.document | facts)
+
     def named(self, setup_id: str) -> Self:
         """The same set-up under another name."""
         return replace(self, setup_id=setup_id, document=self.document | {"setup_id": setup_id})

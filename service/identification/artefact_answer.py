@@ -11,7 +11,7 @@ from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import Fine
 from abbe.models.solvers.artefact_shares import field_shares, shares_text
 from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.observability.poses import pose_rank
+from abbe.models.solvers.observability.poses import are_tilted, pose_rank
 from abbe.models.solvers.plate_fit import plate_fit
 from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 
@@ -22,6 +22,7 @@ ONE_PLANE_MM = 5.0
 """Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""
 WHOLE_TO, NOTHING_FROM = 0.35, 1.0
 """Ratios of mean squared uncertainty to mean squared deviation: up to the first a map is offered whole, from the second not at all."""
+TILTED = "The artefact lay tilted: which errors its poses hide is not listed, U of the deviation says how much they leave open."
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
 NO_LENGTH = "; no length is calibrated: the scale is not observable"
 NOT_SENSED = "; the third direction was not sensed"
@@ -31,7 +32,7 @@ def artefact_lines(joint: JointSolution) -> list[str]:
     """Return sentences: errors that the poses of an artefact hide, and the pose that would show them; the shares of artefact and machine
     in the named error fields; and the separate fit of every workpiece."""
     rank = pose_rank(joint.data)
-    poses = [] if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
+    poses = [TILTED] * are_tilted(joint.data) if rank is None else [rank.text, shares_text(field_shares(joint, rank), rank)]
     return poses + [fit.text for run in joint.data if (fit := plate_fit(run)) is not None]
 
 

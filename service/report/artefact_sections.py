@@ -105,7 +105,16 @@ def pose_readings(run: Run, data: RunData) -> Evaluated:
             "µm", method,
         ),
     ]  # fmt: skip
+    figures += _stylus(run)
     return Evaluated(figures=figures, pictures=_read_features(nominal, deviation, expanded), not_observable=[ALONE])
+
+
+def _stylus(run: Run) -> list[ReportFigure]:
+    """The radius of the stylus as a qualification sphere showed it in this run."""
+    radius, u = (run.setup.document.get(key) for key in ("tool_radius_mm", "u_tool_radius_mm"))
+    if radius is None or u is None:
+        return []
+    return [ReportFigure("Stylus", "r", "radius of the stylus with its pre-travel", 1e3 * radius, 1e3 * u, "µm", "qualification sphere")]
 
 
 def _without_motion(data: RunData) -> F1:

@@ -37,7 +37,7 @@ from abbe.service.runs.sample_columns import (
     starts_in_stream,
     sync_edges,
 )
-from abbe.service.runs.touches import touch_columns
+from abbe.service.runs.touches import qualified_mm, touch_columns
 from abbe.service.storage.store import Store
 
 
@@ -129,7 +129,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
             test=record.test,
             role=record.role,
             machine=start.machine,
-            setup=_setup(record),
+            setup=_qualified(_setup(record), chunks),
             columns=columns,
             table=start.table,  # a solution is meaningful only together with the active table
             timing=RunTiming.from_document(timing),
@@ -181,15 +181,30 @@ def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord])
         edges, complete = sync_edges(samples, start), record.status == "complete"
         clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end, edges)
         return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate), clock.doc
-    records = [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
     setup = _setup(record)
     if isinstance(setup, ArtefactSetup):
-        return touch_columns([parsed(TouchRecord, one) for one in records], start, setup.pose), {}
+        return touch_columns(_touches(chunks), start, setup.pose), {}
+    records = _records(chunks)
     if isinstance(setup, BarSetup):
         return bar_point_columns([parsed(BarRecord, one) for one in records], start), {}
     if setup.nominal_beam is None:
         raise KeyError("nominal_beam")
     return laser_columns([parsed(LaserRecord, one) for one in records], start, setup.nominal_beam), {}
+
+
+def _records(chunks: Sequence[ChunkRecord]) -> list[dict[str, Any]]:
+    return [one for chunk in _of(chunks, LASER_CHANNEL, JSON_CODEC) for one in decode_json(chunk.payload)]
+
+
+def _touches(chunks: Sequence[ChunkRecord]) -> list[TouchRecord]:
+    return [parsed(TouchRecord, one) for one in _records(chunks)]
+
+
+def _qualified(setup: AnySetup, chunks: Sequence[ChunkRecord]) -> AnySetup:
+    """Return the set-up of an artefact with the radius of the stylus that a qualification sphere showed; others as they are."""
+    stated = setup.document.get("tool_radius_mm")
+    found = qualified_mm(_touches(chunks), float(stated)) if isinstance(setup, ArtefactSetup) and stated is not None else None
+    return setup if found is None else setup.noted(tool_radius_mm=round(found[0], 6), u_tool_radius_mm=round(found[1], 6))
 
 
 def _of(chunks: Sequence[ChunkRecord], channel: str, codec: str) -> list[ChunkRecord]:

@@ -49,6 +49,19 @@ def found_feature(touched: TouchedFeature) -> FoundFeature:
     return FoundFeature(centre, radius, spread, u_radius)
 
 
+def qualified_mm(records: Sequence[TouchRecord], stated_mm: float) -> tuple[float, float] | None:
+    """Return the radius of the stylus with its pre-travel as the qualification sphere showed it in a run, and its standard uncertainty.
+
+    ``stated_mm``: radius that the recipe states; None: no sphere was touched.
+    """
+    known = [(found_feature(r), r.radius_mm, r.u_sphere_mm) for r in records if r.radius_mm is not None and r.u_sphere_mm is not None]
+    if not known:
+        return None
+    off = float(np.mean([found.radius_mm - expected for found, expected, _ in known]))
+    by_touch = float(np.sqrt(np.sum([found.u_radius_mm**2 for found, _, _ in known]))) / len(known)
+    return stated_mm + off, float(np.hypot(by_touch, known[0][2]))
+
+
 def _free(sides: F2) -> F2:
     """Return the directions in which the touches find the centre, as rows: a plane for a hole, all for a ball."""
     _, size, rows = np.linalg.svd(sides, full_matrices=False)
@@ -63,10 +76,13 @@ def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> f
 def touch_columns(records: Sequence[TouchRecord], start: RunStart, pose: ArtefactPose) -> Columns:
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
+    Touches of the qualification sphere are no rows (`qualified_mm`).
+
     ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches
     divided by the root of their number, and the travel between two readings of the probe input, an error that repeated touches share.
     A ball's height comes from one side and the radius, so it is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
+    records = [record for record in records if not record.qualifies]
     found = [found_feature(record) for record in records]
     deviation = [(f.centre_mm - pose.origin_mm) @ pose.matrix - np.array(r.nominal_mm) for f, r in zip(found, records, strict=True)]
     spread = float(np.sqrt(np.mean([f.spread_mm**2 for f in found]))) if found else 0.0

@@ -110,9 +110,9 @@ class FeatureTouch:
             "feature": step.feature, "inside": step.inside, "nominal_mm": list(step.nominal_mm), "target_mm": list(step.centre_mm),
             "sides": [list(s) for s in step.sides], "touches_mm": touches, "start_deg": step.start_deg,
             "feed_mm_min": step.touch_feed_mm_min, "resolution_mm": self._period_s * step.touch_feed_mm_min / 60.0,
-            "false_trips": self.false_trips,
+            "false_trips": self.false_trips, "radius_mm": step.radius_mm, "u_sphere_mm": step.u_sphere_mm,
         }  # fmt: skip
-        self._check_radius(found_feature(parsed(TouchedFeature, record)).radius_mm)
+        self._check_radius(parsed(TouchedFeature, record))
         return record
 
     async def _ready(self) -> None:
@@ -120,7 +120,7 @@ class FeatureTouch:
         if not state.fitted or state.deflected:
             what = "the stylus is deflected" if state.fitted else "no touch probe is fitted and ready"
             remedy = "free it by hand, away from the artefact" if state.fitted else "fit it, look at its battery and its stylus"
-            raise ProbeNotReady(f"feature {self.step.feature}: {what}", f"{remedy}; then resume")
+            raise ProbeNotReady(f"{self.step.what}: {what}", f"{remedy}; then resume")
 
     async def _rise(self) -> None:
         """Rise to the clear height first: an abort may have left the stylus beside a ball or in a hole."""
@@ -145,7 +145,7 @@ class FeatureTouch:
             await self._move(step.before_mm(side))
             if latch is None:
                 raise MissedContact(
-                    f"feature {step.feature}: no contact within {step.search_mm:g} mm of where it was expected",
+                    f"{step.what}: no contact within {step.search_mm:g} mm of where it was expected",
                     "check the feature, the place of the artefact and the probe's battery, then resume",
                 )
             found.append(latch.position_mm)
@@ -156,7 +156,7 @@ class FeatureTouch:
                     await self._move(step.centre_mm)
                 return [list(p) for p in same[: step.repeats]]
         raise FalseTrips(
-            f"feature {step.feature}: {len(found)} touches of one side, of which no {step.repeats} agree within {1e3 * AGREE_MM:.0f} um",
+            f"{step.what}: {len(found)} touches of one side, of which no {step.repeats} agree within {1e3 * AGREE_MM:.0f} um",
             "look at the stylus (loose, chipped), at chips on the feature and at the probe's cable or receiver; then resume",
         )
 
@@ -187,7 +187,7 @@ class FeatureTouch:
         await self._move(start)
         x, y, z = latch.position_mm
         raise Obstructed(
-            f"feature {self.step.feature}: the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way",
+            f"{self.step.what}: the probe touched something at X {x:.3f} Y {y:.3f} Z {z:.3f} on its way",
             "the axes backed off; check the artefact (turned by 90 degrees? another one? a clamp in the way?), then resume",
         )
 
@@ -201,7 +201,7 @@ class FeatureTouch:
         for place in way:
             await self._move(place)
         raise ProbeNotReady(
-            f"feature {self.step.feature}: the stylus stays deflected {RESEAT_S:g} s after a touch",
+            f"{self.step.what}: the stylus stays deflected {RESEAT_S:g} s after a touch",
             "look at the stylus, at its seat and at the probe's receiver; then resume",
         )
 
@@ -217,17 +217,18 @@ class FeatureTouch:
         """Three times the time of the longest way at this feed, for low overrides."""
         return 3.0 * 60.0 * 500.0 / feed_mm_min
 
-    def _check_radius(self, found_mm: float) -> None:
-        off = found_mm - self.step.radius_mm
+    def _check_radius(self, touched: TouchedFeature) -> None:
+        off = found_feature(touched).radius_mm - self.step.radius_mm
         if abs(off) > RADIUS_MM:
+            what = "the radius_mm of the sphere" if touched.qualifies else "the radius_mm of the feature"
             raise ProbeUncalibrated(
-                f"feature {self.step.feature}: its radius comes out {abs(off):.3f} mm too {'large' if off > 0.0 else 'small'}",
-                "qualify the stylus; correct stylus_radius_mm or the radius_mm of the feature",
+                f"{touched.what}: its radius comes out {abs(off):.3f} mm too {'large' if off > 0.0 else 'small'}",
+                f"qualify the stylus; correct stylus_radius_mm or {what}",
             )
 
 
 def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> None:
-    """Compare a feature with its first touches in the same pose: stylus and artefact have to be as they were.
+    """Compare a feature or sphere with its first touches in the same pose: stylus and artefact have to be as they were.
 
     Raises
     ------
@@ -242,13 +243,14 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
     drift, expanded = now.radius_mm - then.radius_mm, COVERAGE * math.hypot(then.u_radius_mm, now.u_radius_mm)
     if abs(drift) > QUALIFIED_MM + expanded:
         raise SetupDisturbed(
-            f"feature {touched.feature}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um while {len(earlier)} features "
+            f"{touched.what}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um while {len(earlier)} features "
             "were touched: the stylus is no longer as it was qualified",
             "its points so far are kept as evidence; tighten or change the stylus, qualify it, and the pose is measured from the beginning",
         )
     moved = math.dist(now.centre_mm, then.centre_mm)
     if moved > MOVED_MM:
+        why = "the stylus was changed or knocked, or the sphere is loose" if touched.qualifies else "the artefact is loose"
         raise SetupDisturbed(
-            f"feature {touched.feature} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: the artefact is loose",
+            f"{touched.what} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: {why}",
             "its points so far are kept as evidence; it is clamped anew and measured from the beginning",
         )

@@ -40,6 +40,7 @@ from abbe.service.sequences.steps import (
     TestPlan,
     TouchFeature,
     Unmount,
+    references_of,
 )
 
 LEAD_S, LEAD_MM = 0.5, 5.0
@@ -241,8 +242,8 @@ class ResumeTrail:
 
     With ``carried`` records the last one is read again at ``upto``. On the way forward every axis moves as before, so that its lost motion
     is the same. ``latest``: where the trail passes a place twice, the machine stands on the later passage. Empty trail: nothing is mounted.
-    Trail of one point: the machine must stand there, and nothing moves. ``again``: reference feature of an artefact, which is touched again
-    and must lie where the first of the ``carried`` records found it.
+    Trail of one point: the machine must stand there, and nothing moves. ``again``: references of an artefact's pose, which are touched
+    again and must be as the first of the ``carried`` records found them.
     """
 
     trail: tuple[Point, ...] = ()
@@ -251,7 +252,7 @@ class ResumeTrail:
     feed_mm_min: float = 1000.0
     latest: bool = False
     carried: tuple[dict[str, Any], ...] = ()
-    again: TouchFeature | None = None
+    again: tuple[TouchFeature, ...] = ()
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,11 +345,11 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
 
 
 def _after_feature(test: TestPlan, records: tuple[dict[str, Any], ...]) -> Rest:
-    """Resume an artefact at the next feature, after its reference was touched again. The stylus leaves a feature by itself."""
+    """Resume an artefact at the next feature, after its references were touched again. The stylus leaves a feature by itself."""
     touches = [(k, s) for k, s in enumerate(test.steps) if isinstance(s, TouchFeature)]
-    done = min(len(records), len(touches) - 1)  # the last one is the reference
-    first = touches[done][0]
-    return replace(test, steps=test.steps[first:]), first, ResumeTrail(carried=records[:done], again=touches[0][1]), None
+    done = min(len(records), len(touches) - 1)  # the last one is a reference
+    first, again = touches[done][0], references_of(s for _, s in touches[:done])
+    return replace(test, steps=test.steps[first:]), first, ResumeTrail(carried=records[:done], again=again), None
 
 
 def _all_axes_from(trail: tuple[Point, ...]) -> int:

@@ -36,6 +36,7 @@ from abbe.service.sequences.steps import (
     TouchFeature,
     Unmount,
     ZeroLaser,
+    references_of,
 )
 from abbe.service.sequences.waiting import ExpectedTable, paused
 from abbe.service.sequences.watch import NOTHING, Watch, watched
@@ -108,8 +109,8 @@ class Runner:
         self._waited_s = 0.0
         self._points = 0
         self._still = self._stands = self._paused_here = False
-        self._reference: TouchFeature | None = None
-        """First feature of an artefact's pose: it is touched again to see whether stylus and artefact are as they were."""
+        self._references: tuple[TouchFeature, ...] = ()
+        """Qualification sphere and first feature of a pose: touched again, they show whether stylus and artefact have changed."""
         self.touched = False
         """Whether a person may have touched the set-up in the pause that ended the run."""
         self.hand: int | None = None
@@ -233,7 +234,7 @@ class Runner:
         """Return to the last checkpoint along the way that the test came; return the new position, or None if nothing is mounted."""
         resume_trail = attempt.resume_trail
         self.records = list(resume_trail.carried)  # what fails on the way must not lose them
-        if resume_trail.again is not None:
+        if resume_trail.again:
             return await self._same_artefact(resume_trail.again, resume_trail.carried, recorder, watch)
         if not resume_trail.trail:
             return None
@@ -267,14 +268,16 @@ class Runner:
             await recorder.add_record(one)
         self._points = len(carried)
 
-    async def _same_artefact(self, reference: TouchFeature, carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch) -> Point:
-        """Touch the first feature again: only an equal place proves an undisturbed artefact. Then keep the earlier features."""
-        self._reference = reference
+    async def _same_artefact(
+        self, references: tuple[TouchFeature, ...], carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch
+    ) -> Point:
+        """Touch the references again: only equal ones prove an undisturbed stylus and artefact. Then keep the earlier features."""
+        self._references = references
         await self._requalified(watch)
         for one in carried:
             await recorder.add_record(one)
         self._points = len(carried)
-        return reference.above_mm
+        return references[-1].above_mm
 
     # ---- single steps -----------------------------------------------------------------------------------------------
 
@@ -309,7 +312,7 @@ class Runner:
             case TouchFeature():
                 record = await self._touched(step, watch)
                 check_same(parsed(TouchRecord, record), [parsed(TouchRecord, one) for one in self.records])
-                self._reference = self._reference if self.records else step
+                self._references = references_of((*(self._references if self.records else ()), step))
                 await self._kept(record, recorder)
             case FollowPath():
                 await self._stands_at(step.points_mm[0])
@@ -320,14 +323,14 @@ class Runner:
 
     async def _touched(self, step: TouchFeature, watch: Watch) -> dict[str, Any]:
         """Touch a feature. Its time is the end of the touches, its temperature that of the air if there is a laser. After a pause, which
-        a person may have used to touch stylus or artefact, first touch the first feature, then begin this one anew.
+        a person may have used to touch stylus or artefact, first touch the references, then begin this one anew.
         """
         record = None
         while record is None:
             await self._safe_place(step, watch)
             paused_here, self._paused_here = self._paused_here, False
-            if paused_here and self.records and self._reference not in (None, step):
-                await self._requalified(watch)
+            if paused_here and self.records:
+                await self._requalified(watch, but=step)
             record = await FeatureTouch(need_probe(self._s.controller), step, lambda: self._control.stopping or self._control.pausing).run()
         status = await self._s.controller.status()
         check_interlocks(status)
@@ -335,10 +338,10 @@ class Runner:
         known = {} if air_c is None or math.isnan(air_c) else {"temperature_C": air_c}
         return {"host_s": status.host_s, "ctrl_us": status.ctrl_us, **record, **known}
 
-    async def _requalified(self, watch: Watch) -> None:
-        reference, earlier = self._reference, [parsed(TouchRecord, one) for one in self.records]
-        assert reference is not None
-        check_same(parsed(TouchRecord, await self._touched(reference, watch)), earlier)
+    async def _requalified(self, watch: Watch, but: TouchFeature | None = None) -> None:
+        earlier = [parsed(TouchRecord, one) for one in self.records]
+        for reference in (one for one in self._references if one != but):
+            check_same(parsed(TouchRecord, await self._touched(reference, watch)), earlier)
 
     async def _stands_at(self, start_mm: Point) -> None:
         """Refuse a path unless the machine stands at its start: from elsewhere the first move may lead through the sphere."""

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+from abbe.service.domain.artefact import touched_name
 from abbe.service.domain.run import AnySetup, BarSetup
 
 Point = tuple[float, float, float]
@@ -113,7 +114,8 @@ class TouchFeature:
     ``centre_mm``: expected axis position with the tip in its centre (hole: at the depth of the touches); ``radius_mm``: expected distance
     of the tip's centre from it when it touches; ``sides``: unit vectors from the centre to the touches; ``inside``: a hole; ``up``: unit
     vector away from the artefact; ``clear_mm``: height above the centre that is clear. A touch runs from ``search_mm`` before the expected
-    contact to as far beyond it. ``nominal_mm``: in the artefact's axes; ``start_deg``: direction of the first touch.
+    contact to as far beyond it. ``nominal_mm``: in the artefact's axes; ``start_deg``: direction of the first touch; ``u_sphere_mm``:
+    standard uncertainty of the radius of a qualification sphere; None: a feature of the artefact.
     """
 
     feature: str
@@ -129,6 +131,17 @@ class TouchFeature:
     feed_mm_min: float
     touch_feed_mm_min: float
     start_deg: float
+    u_sphere_mm: float | None = None
+
+    @property
+    def qualifies(self) -> bool:
+        """Whether it is the qualification sphere."""
+        return self.u_sphere_mm is not None
+
+    @property
+    def what(self) -> str:
+        """What it is, for people."""
+        return touched_name(self.feature, qualifies=self.qualifies)
 
     @property
     def above_mm(self) -> Point:
@@ -159,6 +172,12 @@ class TouchFeature:
         """All places that the tip can come to, in order."""
         ways = [(*(() if self.inside else (self.over_mm(s),)), self.before_mm(s), self.beyond_mm(s)) for s in self.sides]
         return (self.above_mm, self.centre_mm if self.inside else self.above_mm, *(p for way in ways for p in way), self.above_mm)
+
+
+def references_of(touches: Iterable[TouchFeature]) -> tuple[TouchFeature, ...]:
+    """Return what is touched again in a pose: the qualification sphere, if there is one, and the first feature."""
+    first = {one.qualifies: one for one in reversed(list(touches))}
+    return tuple(first[kind] for kind in (True, False) if kind in first)
 
 
 Step = (

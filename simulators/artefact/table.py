@@ -1,4 +1,4 @@
-"""Artefact on the table: a plate that the probe in the spindle can touch, once the fixture has mounted both."""
+"""Artefact on the table: a plate that the probe in the spindle can touch, once the fixture has mounted both; and a sphere beside it."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,6 +26,8 @@ class PlateUnderProbe:
     def __init__(self, scenario: Scenario, tool_mm: F) -> None:
         self._config, self._seed, self._tool_mm = scenario.artefact, scenario.seed, tool_mm
         self.body = draw_plate(scenario.artefact, scenario.seed)
+        self.sphere_mm, self.sphere_radius_mm = np.array(scenario.sphere.centre_mm) + tool_mm, scenario.sphere.radius_mm
+        """The qualification sphere: centre in workpiece coordinates, and radius; 0: there is none."""
         self.stylus = draw_stylus(scenario.probe, scenario.seed)
         self.quarters = 0
         """Quarter turns by which the next mounting is wrong (tests)."""
@@ -98,7 +100,11 @@ class PlateUnderProbe:
     def _free(self, tip_mm: F, time_s: float) -> F:
         assert self._mounting is not None
         centres = placed(self.body, self._mounting, time_s, self.temperature_c)
-        return clearance(self.body, self._mounting, centres, tip_mm, self.stylus.radius_mm)
+        free = clearance(self.body, self._mounting, centres, tip_mm, self.stylus.radius_mm)
+        if not self.sphere_radius_mm:
+            return free
+        to_sphere: F = np.linalg.norm(tip_mm - self.sphere_mm, axis=1) - self.sphere_radius_mm - self.stylus.radius_mm
+        return np.minimum(free, to_sphere)
 
     def _turned(self, origin_mm: F, matrix: F) -> tuple[F, F]:
         """Turn the plate about its own centre."""

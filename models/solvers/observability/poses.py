@@ -55,7 +55,7 @@ def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
     if not mine or len({p.artefact for _, p in mine}) > 1 or any(p.normal.any() for _, p in mine):
         return None
     third = {int(np.argmax(np.abs(p.matrix[:, 2]))) for _, p in mine}
-    if len(third) != 1 or any(np.abs(p.matrix[:, 2]).max() < 1.0 - FLAT for _, p in mine):
+    if len(third) != 1 or are_tilted(runs):
         return None
     keep = [k for k in range(3) if k not in third]
     free = not any(r.points is not None and r.points.source == "length" for r in runs)
@@ -68,6 +68,11 @@ def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
             cures.append((name, better, tuple(h for h in hidden if h not in left)))
     cures.sort(key=lambda one: -one[1])
     return PoseRank("XYZ"[keep[0]] + "XYZ"[keep[1]], rank, 27, hidden, tuple(cures))
+
+
+def are_tilted(runs: tuple[RunData, ...]) -> bool:
+    """Whether a probed artefact lay tilted in some pose: its plane is none of the machine's."""
+    return any(np.abs(r.points.matrix[:, 2]).max() < 1.0 - FLAT for r in runs if r.points is not None and r.points.source == "probe")
 
 
 @dataclass(frozen=True)

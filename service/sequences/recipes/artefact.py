@@ -1,14 +1,14 @@
 """The recipe of an artefact in one pose: every hole or ball touched from all sides, the first one again and again.
 
 The first feature is the reference of the pose: touched again after every ``requalify_every`` features and at the end, it shows whether the
-probe or the artefact has changed meanwhile, and how the pose drifts.
+probe or the artefact has changed meanwhile, and how the pose drifts. With a qualification sphere on the table, the stylus is qualified
+there before the first feature and each time before that is touched again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import KW_ONLY, dataclass, replace
-from itertools import pairwise
 from typing import Annotated, Literal
 
 import numpy as np
@@ -16,17 +16,17 @@ import scipy
 from pydantic import Field as Limits
 
 from abbe.models.machine import Machine
-from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject, Feature
+from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject, Feature, QualificationSphere
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import Array, Coordinate, Feed, Name, TestRecipe, as_point, inner
+from abbe.service.sequences.recipes.clearance import Balls, Boxes, check_clear, probe_parts
 from abbe.service.sequences.steps import CampaignPlan, MountArtefact, MoveTo, Step, TestPlan, TouchFeature, Unmount
 
 BALL, HOLE = "xyz", "xy"
 LARGEST_TILT_DEG = 2.0
 """Largest tilt of a hole's axis against the stylus; beyond it the shaft of the stylus may touch the wall."""
-WAY_POINTS = 9
 Angle = Annotated[float, Limits(ge=-360.0, le=360.0)]
 Millimetres = Annotated[float, Limits(gt=0.0, le=500.0)]
 
@@ -36,9 +36,11 @@ class ArtefactTest(TestRecipe):
     """The features of an artefact in one pose.
 
     ``artefact``: its name under ``[artefact]`` of the file; ``origin_mm``: axis position at which the stylus tip is at the artefact's
-    zero; ``rotation_deg``: the artefact's turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified. ``depth_mm``:
-    of the touches in a hole below its nominal place; ``clear_mm``: height above the features at which the way is free. ``turned_every``:
-    every so many features the first touch is at 45 degrees instead of 0, which shows the lobing; 0: never.
+    zero; ``rotation_deg``: the artefact's turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified;
+    ``stylus_length_mm``: from the centre of its ball to the probe's body of ``body_radius_mm``, None: not known, the body is not checked;
+    ``shaft_radius_mm``: None: as thick as the ball. ``depth_mm``: of the touches in a hole below its nominal place; ``clear_mm``: height
+    above the features at which the way is free. ``turned_every``: every so many features the first touch is at 45 degrees instead of 0,
+    which shows the lobing; 0: never. ``sphere``: on which the stylus is qualified; all ways then lie at one height.
     """
 
     artefact: Name
@@ -46,6 +48,9 @@ class ArtefactTest(TestRecipe):
     _: KW_ONLY
     rotation_deg: tuple[Angle, Angle, Angle] = (0.0, 0.0, 0.0)
     stylus_radius_mm: Millimetres = 3.0
+    shaft_radius_mm: Millimetres | None = None
+    stylus_length_mm: Millimetres | None = None
+    body_radius_mm: Millimetres = 20.0
     depth_mm: Annotated[float, Limits(ge=0.0, le=200.0)] = 6.0
     clear_mm: Millimetres = 20.0
     search_mm: Annotated[float, Limits(ge=0.1, le=5.0)] = 0.8
@@ -54,6 +59,7 @@ class ArtefactTest(TestRecipe):
     turned_every: Annotated[int, Limits(ge=0, le=1000)] = 3
     feed_mm_min: Feed = 3000.0
     touch_feed_mm_min: Feed = 100.0
+    sphere: QualificationSphere | None = None
     kind: Literal["artefact"] = "artefact"
     plate: ArtefactObject | None = inner(None)  # noqa: RUF009 - a field, not a default
 
@@ -74,10 +80,11 @@ class ArtefactTest(TestRecipe):
         if self.plate is None:
             raise ConfigError(f"test {self.label}: the recipe has no artefact {self.artefact!r}", f"add a table [artefact.{self.artefact}]")
         touches = [self._touch(k, f) for k, f in enumerate(self.plate.features)]
-        self._check_neighbours(touches)
-        matrix = self.matrix()
-        steps: list[Step] = [MoveTo(self._aside(touches, machine), self.feed_mm_min, guarded=True)]
-        steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *self._order(touches)]
+        matrix, order = self.matrix(), list(self._order(touches))
+        aside = self._aside(order, machine)
+        self._check_clear(self.plate, order, aside)
+        steps: list[Step] = [MoveTo(aside, self.feed_mm_min, guarded=True)]
+        steps += [MountArtefact(self.origin_mm, (_vector(matrix[0]), _vector(matrix[1]), _vector(matrix[2]))), *order]
         if self.unmount:
             steps.append(Unmount())
         setup: Doc = {
@@ -94,37 +101,55 @@ class ArtefactTest(TestRecipe):
         axis = int(np.argmax(np.abs(out)))
         along: Array = np.sign(out[axis]) * np.eye(3)[axis]
         tilt = float(np.degrees(np.arccos(min(float(out @ along), 1.0))))
-        if inside and tilt > LARGEST_TILT_DEG:
+        thin = self.shaft_radius_mm is None or self.depth_mm * np.tan(np.radians(tilt)) <= self.stylus_radius_mm - self.shaft_radius_mm
+        if inside and (tilt > LARGEST_TILT_DEG or not thin):
             raise ConfigError(
                 f"artefact {self.artefact}, feature {feature.id}: its hole is tilted by {tilt:.0f} degrees against the stylus",
                 "lay the plate flat or upright; balls may be tilted",
             )
         return along
 
-    def _check_neighbours(self, touches: list[TouchFeature]) -> None:
-        """Refuse balls so near to each other that the stylus touches one on its way to another. Raises ConfigError."""
-        balls = [one for one in touches if not one.inside]
-        centres, reach = np.array([one.centre_mm for one in balls]), np.array([one.radius_mm for one in balls])
-        for k, one in enumerate(balls):
-            ways = np.array([[one.above_mm, one.over_mm(side), one.before_mm(side)] for side in one.sides])
-            share = np.linspace(0.0, 1.0, WAY_POINTS)[:, None]
-            places = np.concatenate([a + share * (b - a) for way in ways for a, b in pairwise(way)])
-            free = np.linalg.norm(places[:, None] - centres, axis=2).min(axis=0) - reach
-            free[k] = np.inf
-            near = int(np.argmin(free))
-            if free[near] < self.search_mm:
-                raise ConfigError(
-                    f"artefact {self.artefact}, feature {one.feature}: on its way to it the stylus comes within {free[near]:.1f} mm of "
-                    f"{balls[near].feature}",
-                    "use a smaller stylus or a smaller search_mm, or leave a feature out",
-                )
+    def _check_clear(self, plate: ArtefactObject, order: list[TouchFeature], start_mm: tuple[float, float, float]) -> None:
+        """Refuse ways on which the probe meets a ball, an obstacle or the plate itself. Raises ConfigError."""
+        there = {one.feature: one for one in order if not one.inside}
+        centres, radii = np.array([b.centre_mm for b in there.values()]).reshape(-1, 3), [b.radius_mm for b in there.values()]
+        balls = Balls(tuple(there), centres, np.array(radii) - self.stylus_radius_mm)
+        parts = probe_parts(self.stylus_radius_mm, self.shaft_radius_mm, self.stylus_length_mm, self.body_radius_mm)
+        solids = (balls, Boxes.of(plate.obstacles, self.origin_mm, self.matrix()))
+        check_clear(self.artefact, order, start_mm, parts, solids, self.search_mm)
+        deepest = self.depth_mm + self.search_mm
+        if len(there) < len({one.feature for one in order}) and self.stylus_length_mm is not None and self.stylus_length_mm < deepest:
+            raise ConfigError(
+                f"artefact {self.artefact}: the body of the probe would reach the plate: the stylus is {self.stylus_length_mm:g} mm long, "
+                f"and a hole is touched {self.depth_mm:g} mm deep",
+                "use a longer stylus or a smaller depth_mm",
+            )
 
     def _order(self, touches: list[TouchFeature]) -> Iterator[TouchFeature]:
+        """Yield the touches of the pose. Ways to and from a sphere lie at the height of the highest place above anything."""
+        again = touches[:1]
+        if self.sphere is not None:
+            again = [self._qualification(self.sphere, touches[0]), touches[0]]
+            up = np.array(touches[0].up)
+            top = max(float(np.array(one.above_mm) @ up) for one in (*touches, *again))
+            touches, again = ([replace(t, clear_mm=top - float(np.array(t.centre_mm) @ up)) for t in some] for some in (touches, again))
+            yield again[0]
         for k, one in enumerate(touches):
             if k and k % self.requalify_every == 0:
-                yield touches[0]
+                yield from again
             yield one
-        yield touches[0]
+        yield from again
+
+    def _qualification(self, sphere: QualificationSphere, like: TouchFeature) -> TouchFeature:
+        """Return the touches of the qualification sphere. Raises ConfigError if a feature has its name."""
+        if self.plate is not None and sphere.id in {f.id for f in self.plate.features}:
+            raise ConfigError(f"artefact {self.artefact}: sphere and feature are both called {sphere.id!r}", "give the sphere another id")
+        reach = sphere.radius_mm + self.stylus_radius_mm
+        return replace(
+            like, feature=sphere.id, nominal_mm=(0.0, 0.0, 0.0), centre_mm=as_point(np.array(sphere.centre_mm)), radius_mm=reach,
+            sides=_sides(np.array(like.up), 0.0, ball=True), inside=False, clear_mm=self.clear_mm + reach, start_deg=0.0,
+            u_sphere_mm=sphere.U_mm / sphere.k,
+        )  # fmt: skip
 
     def _aside(self, touches: list[TouchFeature], machine: Machine) -> tuple[float, float, float]:
         """Where the machine waits for the person: above the first feature, as far away from the artefact as the strokes allow."""

@@ -217,6 +217,8 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
 
 def _toml(value: Any) -> str:
     """Format a TOML value: for text, numbers and their lists JSON is TOML, except the ASCII DEL; a list of tables has one per line."""
+    if isinstance(value, BaseModel):
+        value = value.model_dump(by_alias=True, exclude_none=True)
     if isinstance(value, dict):
         return "{ " + ", ".join(f"{key} = {_toml(one)}" for key, one in value.items()) + " }"
     if isinstance(value, list | tuple) and value and isinstance(value[0], dict):

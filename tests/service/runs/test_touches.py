@@ -10,7 +10,7 @@ import pytest
 from abbe.service.domain.document import parsed
 from abbe.service.domain.measured import RunStart, TouchRecord
 from abbe.service.domain.run import ArtefactPose
-from abbe.service.runs.touches import found_feature, touch_columns
+from abbe.service.runs.touches import found_feature, qualified_mm, touch_columns
 
 SIDES = [[1.0, 0.0, 0.0], [-1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, -1.0, 0.0]]
 OFF = np.array([0.31, -0.22, 0.0])
@@ -72,3 +72,13 @@ def test_a_laser_less_run_has_no_temperature():
     columns = touch_columns([record(np.array([100.0, 80.0, 30.0]), ball=True)], START, POSE)
     assert np.isnan(columns.further["temperature_C"]).all()
     assert np.isfinite(columns.further["deviation_z_mm"]).all()
+
+
+def test_spheres_qualify_the_stylus_and_are_no_rows():
+    place = np.array([100.0, 80.0, 30.0])
+    spheres = [record(place, ball=True, noise=1e-3, feature="S", radius_mm=7.01, u_sphere_mm=2e-4) for _ in range(2)]
+    assert len(touch_columns([spheres[0], record(place), spheres[1]], START, POSE)) == 1
+    assert qualified_mm([record(place)], 3.0) is None
+    radius, u = qualified_mm(spheres, 3.0) or (0.0, 0.0)
+    assert radius == pytest.approx(2.99, abs=2e-3)
+    assert 2e-4 < u < 1e-3
