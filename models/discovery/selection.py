@@ -59,7 +59,8 @@ KIN = 0.02
 def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
     """Optimise the non-linear parameters of ``pick`` one after the other; return the pick and its gain.
 
-    Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name.
+    Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name. Where the readings
+    do not tell a parameter of a name, it takes its usual value (`Parameter.prior_sd`).
     """
     best = gain_of(problem, pick, rows)
     if not pick.effect.shape:
@@ -87,11 +88,18 @@ def _along(parameter: Parameter, pick: Pick, best: float, gain: Callable[[Pick],
     def at(x: float) -> Pick:
         return with_values(pick, {**pick.values, parameter.name: float(np.exp(x)) if logs else float(x)})
 
+    def unusual(tried: Pick) -> float:
+        return 0.0 if pick.unnamed else ((tried.values[parameter.name] - parameter.typical) / parameter.prior_sd) ** 2
+
     bounds = (np.log(low), np.log(high)) if logs else (low, high)
     found = scipy.optimize.minimize_scalar(
-        lambda x: -gain(at(x)), bounds=bounds, method="bounded", options={"maxiter": EVALUATIONS, "xatol": 1e-4 * (bounds[1] - bounds[0])}
+        lambda x: unusual(at(x)) - gain(at(x)),
+        bounds=bounds,
+        method="bounded",
+        options={"maxiter": EVALUATIONS, "xatol": 1e-4 * (bounds[1] - bounds[0])},
     )
-    return (at(found.x), -float(found.fun)) if -found.fun > best else (pick, best)
+    better = at(found.x)
+    return (better, unusual(better) - float(found.fun)) if -found.fun > best - unusual(pick) else (pick, best)
 
 
 def _neighbours(parameter: Parameter, value: float) -> tuple[float, float]:

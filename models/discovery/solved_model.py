@@ -73,7 +73,7 @@ def _steps(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[list[F2], S
 
 
 def _shape_sd(pick: Pick) -> F1:
-    return np.array([0.3 * (q.high - q.low) for q in pick.effect.shape])
+    return np.array([q.prior_sd for q in pick.effect.shape])
 
 
 def _moved(pick: Pick, change: F1, covariance: F2) -> Pick:

@@ -18,6 +18,9 @@ Family = Literal["drive", "structure", "thermal", "instrument", "geometry"]
 Remedy = Literal["table", "control parameter", "mechanics", "warm up or sensor", "set-up"]
 """What removes an effect: a compensation table, a parameter of the control, a fitter's work, temperature control, a better set-up."""
 
+PRIOR_SHARE = 0.3
+"""Standard uncertainty of a non-linear parameter before any reading, as a share of its range: that of a uniform distribution, 1/sqrt(12)."""
+
 
 @dataclass(frozen=True, slots=True)
 class Parameter:
@@ -30,6 +33,11 @@ class Parameter:
     typical: float
     source: str
     starts: tuple[float, ...]
+
+    @property
+    def prior_sd(self) -> float:
+        """Return the standard uncertainty of the parameter before any reading."""
+        return PRIOR_SHARE * (self.high - self.low)
 
 
 @dataclass(frozen=True, slots=True)

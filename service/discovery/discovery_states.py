@@ -31,6 +31,8 @@ SOME = 0.2
 LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller gap may also be the prediction's own
 error, so it does not refute an effect with which the holdout runs agree better."""
+FELT = 0.01
+"""Smallest relative change of the rms of the holdout runs, with and without one effect, at which these runs can judge it."""
 WORSE = 1.05
 """Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0
@@ -140,6 +142,9 @@ def _judged(finding: Finding, *, moving: bool) -> Judgement:
     if not moving:
         rule = "an effect that only adds scatter closes no gap: judged by evidence alone"
         return Judgement(rule=rule, proved=None, closed=share, gap=gap)
+    needed = [e.needed for e in _names(finding) if e.kind == "mean" and e.needed is not None]
+    if needed and max(abs(n - 1.0) for n in needed) < FELT and gap.after_um < LEFT * gap.floor_um:
+        return Judgement(rule="the effect hardly changes the readings of the holdout runs", proved=None, closed=share, gap=gap)
     if SOME <= share < CLOSED and gap.after_um < LEFT * gap.floor_um:
         return Judgement(
             rule="the holdout runs agree better with the effect, but show too little of the gap", proved=None, closed=share, gap=gap

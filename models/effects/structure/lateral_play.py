@@ -31,6 +31,12 @@ def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
     return along(direction_of(key), half * x, half * (x**2 - VISITED))
 
 
+def _at_rest(path: Path, at: Places, key: str, values: Values) -> F3:
+    """Return the shift in runs that do not move the axis: the direction of its last motion, before the run, is unknown."""
+    rests = at is path.at and not at.sign[:, axis_of(key)].any()
+    return along(direction_of(key), np.full(len(at.t_s), 0.5 * UM * rests))
+
+
 EFFECT = Effect(
     name="lateral_play",
     title="lateral play of a carriage",
@@ -42,7 +48,7 @@ EFFECT = Effect(
     shape=(),
     signal=of_machine(jump),
     strength=first,
-    forms=(Form("settling", of_machine(_settling)), Form("along the guide", of_path(_along_guide))),
+    forms=(Form("settling", of_machine(_settling)), Form("along the guide", of_path(_along_guide)), Form("at rest", of_path(_at_rest))),
     needs="runs in both directions",
     signature="a step across the axis where it reverses: a pair of steps or spikes away from the ends of the deviating axis",
     remedy="mechanics",

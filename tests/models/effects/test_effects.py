@@ -162,6 +162,16 @@ def test_lateral_play_steps_sideways() -> None:
     np.testing.assert_allclose(of("lateral_play", "EYX")[run("c00")][:, 0], 0.5e-3 * path.at.sign[:, 0] * path.look[:, 1])
 
 
+def test_lateral_play_of_an_axis_at_rest_is_a_shift_of_unknown_size() -> None:
+    """Its last motion was before the run; only its form knows it, and only in runs that do not move the axis."""
+    form = next(f for f in BY_NAME["lateral_play"].forms if f.name == "at rest")
+    still = [not p.at.sign[:, 2].any() for p in PATHS]
+    assert 0 < sum(still) < len(still)
+    for path, columns, plain, rests in zip(PATHS, form.signal(PATHS, "EXZ", {}), of("lateral_play", "EXZ"), still, strict=True):
+        np.testing.assert_allclose(columns[:, 0], 0.5e-3 * rests * path.look[:, 0])
+        assert not (rests and plain.any())
+
+
 def test_a_bed_turns_over_across_the_other_axis() -> None:
     path = PATHS[run("l0")]
     x, z = path.at.q_mm[:, 0] / 600.0, path.at.q_mm[:, 2] / 225.0 - 1.0

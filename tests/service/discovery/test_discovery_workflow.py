@@ -118,6 +118,10 @@ def test_runs_judge_only_where_the_gap_shows_in_them() -> None:
     assert judged("holdout", gap_um(0.9, 0.9, 0.3), one_effect()).proved is False
     assert judged("holdout", gap_um(0.43, 0.415, 0.39), one_effect()).proved is None  # the prediction errs by as much as what is left
     assert judged("holdout", gap_um(0.43, 0.43, 0.39), one_effect()).proved is False
+    unfelt = judged("holdout", gap_um(0.43, 0.43, 0.39), replace(one_effect(), needed=1.003))
+    assert (unfelt.proved, unfelt.rule) == (None, "the effect hardly changes the readings of the holdout runs")
+    assert judged("holdout", gap_um(0.43, 0.43, 0.39), replace(one_effect(), needed=0.97)).proved is False
+    assert judged("holdout", gap_um(0.9, 0.9, 0.3), replace(one_effect(), needed=1.003)).proved is False  # what is left has another cause
     run_away = judged("identify", gap_um(2.0, 90.0, 1.0), one_effect())
     assert (run_away.proved, run_away.rule) == (False, "the identify runs agree worse with the effect than without it")
     assert gap_um(0.29, 0.29, 0.3).closed is None
