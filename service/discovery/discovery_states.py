@@ -143,7 +143,8 @@ def _judged(finding: Finding, *, moving: bool) -> Judgement:
         rule = "an effect that only adds scatter closes no gap: judged by evidence alone"
         return Judgement(rule=rule, proved=None, closed=share, gap=gap)
     needed = [e.needed for e in _names(finding) if e.kind == "mean" and e.needed is not None]
-    if needed and max(abs(n - 1.0) for n in needed) < FELT and gap.after_um < LEFT * gap.floor_um:
+    unfelt = bool(needed) and max(abs(n - 1.0) for n in needed) < FELT
+    if share < CLOSED and unfelt and gap.after_um < LEFT * gap.floor_um:
         return Judgement(rule="the effect hardly changes the readings of the holdout runs", proved=None, closed=share, gap=gap)
     if SOME <= share < CLOSED and gap.after_um < LEFT * gap.floor_um:
         return Judgement(
