@@ -19,7 +19,7 @@ Remedy = Literal["table", "control parameter", "mechanics", "warm up or sensor",
 """What removes an effect: a compensation table, a parameter of the control, a fitter's work, temperature control, a better set-up."""
 
 PRIOR_SHARE = 0.3
-"""Standard uncertainty of a non-linear parameter before any reading, as a share of its range: that of a uniform distribution, 1/sqrt(12)."""
+"""Standard uncertainty of a non-linear parameter before any reading, as a share of its range, about as for a uniform distribution."""
 
 
 @dataclass(frozen=True, slots=True)
