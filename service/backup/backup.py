@@ -335,7 +335,7 @@ def _latest_shared(folder: Path, identity: str) -> Path | None:
 
 
 def _segments(folder: Path, source: BackupSource) -> int:
-    """Copy the capture's segments. One that vanishes meanwhile is in the database, which is copied afterwards."""
+    """Copy the capture's segments. A segment that vanishes meanwhile is in the database, which is copied afterwards."""
     own = segment_folder(source.url, source.capture)
     found = [path for one in (own, *other_folders(source.url, source.capture, own)) for path in sorted(one.glob("run-*"))]
     if found:
@@ -355,8 +355,7 @@ def _segments(folder: Path, source: BackupSource) -> int:
 
 
 def _audit(part: Path, copy: Path, source: BackupSource, *, with_key: bool) -> ListedAudit:
-    """Copy the audit's files. The heads are copied after the database, so that every copied record has its head; later heads are left
-    out."""
+    """Copy the audit's files, the heads after the database: every copied record then has its head. Heads of later records are left out."""
     with Store.open(source.url) as store:
         book = AuditBook(store, source.url)
     if not book.key_file.exists():
