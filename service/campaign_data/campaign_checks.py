@@ -118,8 +118,7 @@ wrong."""
 
 
 def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flag ball-bar runs whose columns feed_mm_min or direction contradict their positions and times; the search uses positions and
-    times."""
+    """Flag ball-bar runs whose feed_mm_min or direction contradicts their positions and times, which the search then uses."""
     out = []
     senses: dict[tuple[str, int], dict[str, float]] = {}
     for run in runs:
@@ -261,7 +260,7 @@ def artefact_issues(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
 def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
     """Return issues that need no model: machine, geometry, units, times, copies, too few readings.
 
-    ``machine``: the campaign's machine object; ``runs``: those with readings.
+    ``machine``: the campaign's machine object; ``runs``: its runs with readings.
     """
     out = _twice([r.run_id for r in runs])
     for run in runs:
@@ -341,7 +340,8 @@ def _readings(run: Run) -> list[CampaignIssue]:
 
 
 def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
-    """Return the issue of too large deviations: many mean another unit, some a lost beam or bar; robust weights handle single ones."""
+    """Return the issue of too large deviations: many mean another unit, some mean a lost beam or bar; robust weights handle single
+    outliers."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:

@@ -23,10 +23,11 @@ from abbe.service.storage.store import Store
 
 @dataclass(frozen=True)
 class Campaign:
-    """A campaign for a solver. ``folder``: its source, None if the store; ``doc``: its campaign object.
+    """A campaign for a solver. ``folder``: its source, None for a campaign of the store; ``doc``: its campaign object.
 
     ``removed``: the table whose side effects were subtracted from the readings; None without one. ``tables``: images of the compensation
-    tables that acted during the runs, by CRC, as far as the folder holds them; empty for a campaign of the store, which has its own.
+    tables that acted during the runs, by CRC, as far as the folder holds them; empty for a campaign of the store, which holds the images
+    itself.
     """
 
     name: str

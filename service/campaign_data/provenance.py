@@ -73,7 +73,8 @@ def _bytes(values: NDArray[Any]) -> bytes:
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another one; without a file, of its module name."""
+    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another plug-in; without a file, that of its module
+    name."""
     inner = getattr(function, "func", function)  # functools.partial
     name = str(getattr(inner, "__module__", type(inner).__module__))
     file = getattr(sys.modules.get(name), "__file__", None)
