@@ -31,7 +31,7 @@ BREAKS = (LinkDown, ReplyTimeout, Rebooted)
 
 
 async def bar_ready(session: Session, test: TestPlan) -> DeviceInfo | None:
-    """Check before a run that the ball-bar's box, if needed, is the same and has its first settings.
+    """Check before a run that the ball-bar's box, if needed, is still the same box with the same settings.
 
     Raises
     ------

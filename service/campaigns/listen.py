@@ -123,8 +123,8 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
 
 
 async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: Report) -> None:
-    """Wait until the machine stands at the start of the test; without known positions, the person who mounts the mirror there confirms
-    it."""
+    """Wait until the machine stands at the start of the test. If its position is unknown, the person who mounts the mirror there vouches
+    for it."""
     before, reported = None, False
     if not math.isfinite(sum((await session.controller.status()).position_mm)):
         return
@@ -180,8 +180,7 @@ def _stream(heard: Heard) -> tuple[F1, F1]:
 
 
 def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
-    """Return a function from laser to controller time, made of both clocks' fits to the host clock, and the laser's lag, None if
-    unknown."""
+    """Return the function from laser to controller time (both clocks fitted to the host clock), and the laser's lag or None."""
     laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
     cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
 

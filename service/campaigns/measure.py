@@ -166,7 +166,7 @@ def artefacts_of(plan: CampaignPlan) -> dict[str, Any]:
 
 
 async def _table_in_force(session: Session) -> RunTable | None:
-    """Return the compensation table in force; None for a control that shows none."""
+    """Return the compensation table in force; None if the control does not show it."""
     if only_listens(session.controller):
         return None
     comp = await session.controller.comp_status()
