@@ -28,7 +28,7 @@ from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.storage.store import Store
 
 GROUP_S = 0.01
-"""Longest time, s, after its arrival that a sample waits for others to share one sync; a slow sync before it counts too."""
+"""Longest time, s, that a sample waits for the sync that it shares with later samples; an earlier slow sync is part of this time."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 
