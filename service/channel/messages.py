@@ -212,7 +212,8 @@ class ConfirmPrompt(WebRequest):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RollBack(WebRequest):
-    """Replace the table in force, identified by its push and CRC, by the table before it. ``key``: a repeated key is the same order."""
+    """Replace the table in force, identified by its push and CRC, by the table before it. ``key``: requests with the same key are one
+    order."""
 
     kind: Literal["rollback"] = "rollback"
     push: Number
@@ -223,7 +224,7 @@ class RollBack(WebRequest):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PushNow(WebRequest):
-    """Push a proposal with a valid approval now. ``key``: a repeated key is the same order."""
+    """Push a proposal with a valid approval now. ``key``: requests with the same key are one order."""
 
     kind: Literal["push"] = "push"
     proposal: Number
