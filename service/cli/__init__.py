@@ -29,7 +29,7 @@ INTERRUPTED = 130
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run one command and exit with its code (`EXIT_CODES`).
 
-    ``arguments``: used instead of those of the command line, by tests.
+    ``arguments``: replace those of the command line, for tests.
     """
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -45,7 +45,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 def run(arguments: Sequence[str] | None = None) -> int:
     """Run one command and return its exit code; every error of service, device or command line becomes one line on stderr.
 
-    ``arguments``: used instead of those of the command line.
+    ``arguments``: replace those of the command line.
     """
     import typer
 

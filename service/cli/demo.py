@@ -146,7 +146,8 @@ def _folder(keep: Path | None) -> Path:
 
 @contextmanager
 def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
-    """Yield the folder for database and device links: ``folder``, which must not hold another demonstration, or a temporary one."""
+    """Yield the folder for database and device links: ``folder``, or without it a temporary folder. ``folder`` must hold no other
+    demonstration."""
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)

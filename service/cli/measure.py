@@ -327,9 +327,9 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False,
 
 
 def warn_of_open_push(url: str, site: Site) -> None:
-    """Warn on stderr of unfinished pushes, which the push journals show: nothing connects to the control.
+    """Warn on stderr of unfinished pushes in the push journals, without connecting to the control.
 
-    This includes pushes into another address that may be the same control (`open_pushes`).
+    Pushes into another address that may be the same control are included (`open_pushes`).
     """
     from abbe.service.cli.common import open_store
     from abbe.service.errors import StoreError

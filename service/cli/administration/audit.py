@@ -286,7 +286,7 @@ def _database(given: Mapping[str, Any], url_of: Any) -> str:
 
 
 def _missing(url: str) -> Path | None:
-    """Return the SQLite file of a database that does not exist yet; None: it exists, or is not a file."""
+    """Return the SQLite file of a database that does not exist yet; None: the database exists, or is not a file."""
     from abbe.service.storage.engine import parse_url
 
     parsed = parse_url(url)

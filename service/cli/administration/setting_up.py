@@ -51,7 +51,8 @@ def init(  # noqa: PLR0913 - one option for each question
 ) -> None:
     """Write a commented machine file from eight answers, given as options or at the terminal. An existing file is never overwritten.
 
-    For the ball-bar it offers the serial ports that are plugged in. It checks the file before it keeps it: a wrong answer leaves no file.
+    For the ball-bar the command offers the serial ports that are plugged in. It keeps the file only after checking it: a wrong answer
+    leaves no file.
     """
     from abbe.service.config import load_machine
     from abbe.service.domain.machine import DeviceUrls

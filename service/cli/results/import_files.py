@@ -94,7 +94,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
 
 
 def _import_points(files: list[Path], name: str, where: tuple[str | None, Path | None], *, as_json: bool) -> None:
-    """Store lists of an artefact's points as one campaign; they leave nothing to ask."""
+    """Store lists of an artefact's points as one campaign, without questions."""
     from abbe.service.config import load_machine
     from abbe.service.instrument_files.point_list import campaign_of_points
     from abbe.service.runs.exchange import store_folder
@@ -161,7 +161,8 @@ def _import_contents(
 
 
 def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
-    """The column file of a table: as given, as kept beside it, or by questions at the terminal; None if there is none."""
+    """Return the column file of a table: the given one, the one kept beside the table, or one made by questions at the terminal; else
+    None."""
     from abbe.service.instrument_files.columns import column_file, toml_of
     from abbe.service.instrument_files.registry import is_table
 

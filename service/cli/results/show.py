@@ -95,7 +95,8 @@ def show(
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Show one run: state, set-up and statistics of its columns (--json: as an exchange file). Or a campaign: runs and incidents."""
+    """Show one run: state, set-up and statistics of its columns (--json: as an exchange file). For a campaign, show its runs and
+    incidents."""
     from abbe.service.cli.results.show import show_campaign
     from abbe.service.domain.measured import RunRecord
     from abbe.service.queries.measured import run_summary

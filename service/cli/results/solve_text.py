@@ -20,7 +20,7 @@ NAMED = 4
 
 
 def print_solution(summary: Assessment, solution: SolutionFile, *, details: bool) -> None:
-    """Print the summary, what was asked for, and, with ``details``, everything else."""
+    """Print the summary and the requested results; with ``details``, print everything else, too."""
     for line in summary_lines(summary, solution):
         typer.echo(line)
     _tables(solution)
