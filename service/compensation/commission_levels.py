@@ -1,8 +1,8 @@
 """Commissioning of a controller's capabilities: each flag is proved by attempts that it must refuse and attempts that it must accept.
 
 The inactive bank holds a copy of the table in force for every attempt. So the same corrections act as before, whatever the controller
-wrongly accepts and wherever the test is interrupted. No person has to open, press or restart anything; what only such an action
-could show is reported as not shown.
+wrongly accepts and wherever the test is interrupted. No person has to open, press or restart anything; capabilities that only such an
+action could show are reported as not shown.
 
 `Trial` attempts one operation and records whether it was refused. `while_moving` checks that an activation is refused while an axis moves:
 it moves one axis slowly by a few millimetres, up if there is room, and back.

@@ -80,7 +80,7 @@ async def _try(t: Trial, control: OneBank) -> None:
 
 
 async def _on_again(t: Trial, control: OneBank) -> None:
-    """Switch the table on again, and see that it is the same."""
+    """Switch the table on again, and check that it has not changed."""
     if not (await control.table_state()).acts:
         try:
             await control.switch(on=True, expect_crc=t.base.crc)

@@ -522,7 +522,7 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     Raises
     ------
     SignatureRefused
-        There is a signature and it is not valid: that is worse than none.
+        The signature is invalid, which is worse than no signature.
     """
     seal = signature_file(path)
     if not seal.exists():

@@ -1,9 +1,9 @@
 """The one gate in front of every push: it reports all reasons against a table at once.
 
-`check_preconditions` checks what concerns any table for this control, `admit` also one proposal. A push needs an `Admission`, which only
-`admit` makes.
+`check_preconditions` checks the conditions for any table of this control, `admit` also those for one proposal. A push needs an `Admission`,
+which only `admit` makes.
 
-`PushPrecheck` checks everything that was checked for the proposal again, before a register is written.
+`PushPrecheck` repeats all checks of the proposal before a register is written.
 """
 
 from __future__ import annotations

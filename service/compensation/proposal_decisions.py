@@ -29,7 +29,7 @@ class ProposalStatus:
 
 
 def proposal_status(store: Store, number: int, proposed: Proposed, now_s: float, journal: JournalView | None = None) -> ProposalStatus:
-    """The status of a stored proposal. ``journal``: that of its machine, if the caller has read it already."""
+    """The status of a stored proposal. ``journal``: the journal of its machine, if the caller has already read it."""
     journal = journal or JournalView.read(store, proposed.candidate.machine)
     return status_of_proposal(number, proposed, store.proposals.approvals(number), store.proposals.rejections(number), journal, now_s)
 

@@ -61,7 +61,7 @@ class Proposed:
     by, utc : str
         Account of the proposer, and time.
     reasons : tuple of str
-        Reasons against it when it was proposed.
+        Reasons against the proposal when it was made.
     not_for_tables : tuple of str
         Known effects that no table corrects.
     holds_at : str
@@ -110,7 +110,7 @@ class Proposed:
 
     @property
     def valid_until_s(self) -> float:
-        """When the measurement becomes too old, seconds UTC."""
+        """Time at which the measurement becomes too old, seconds UTC."""
         return self.candidate.evidence.ended_s + self.limits.age_h * 3600.0
 
     def binding(self, expiry: str) -> str:

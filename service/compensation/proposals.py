@@ -111,7 +111,7 @@ def _instruments(runs: list[Run]) -> set[str]:
 
 
 def certified_until_s(days: Mapping[str, date], instruments: set[str]) -> tuple[float, ...]:
-    """Ends of the certificates of these instruments; none if one of them has no certificate."""
+    """Ends of the certificates of these instruments; empty if an instrument has no certificate."""
     return tuple(until_s(days[kind]) for kind in sorted(instruments)) if instruments <= days.keys() else ()
 
 
@@ -140,8 +140,7 @@ async def candidate_context(
 
 
 def _month_ago(journal: JournalView, base: Base, clock: Clock) -> NineTables | None:
-    """Return the tables in force `MONTH` ago. If no push was kept by then: the base of the first kept push, or ``base`` if none was ever
-    kept."""
+    """Return the tables in force `MONTH` ago. If no push was kept by then: the base of the first kept push, else ``base``."""
     kept, old = journal.kept(), journal.kept(clock.utc() - MONTH)
     if not kept:
         return base.tables
@@ -342,7 +341,7 @@ def check_same_table(base: Base, runs: list[Run]) -> None:
     Raises
     ------
     TableMismatch
-        Names a run that was not, or that does not state its table.
+        Names a run that was measured with another table, or does not state its table.
     """
     for run in runs:
         crc = run.table.crc

@@ -41,7 +41,7 @@ APPROVED_S = 3600.0
 RECHECK_S = 2.0
 """Pause before the second look at the controller, if a push was given up after its activation was sent."""
 STILL_S, STILL_POLL_S, STILL_LIMIT_S = 1.2, 0.05, 15.0
-"""How long the axes have to stand before a table may change; interval and limit of waiting for it."""
+"""How long the axes have to stand before a table may change; interval between looks, and longest wait for the standstill."""
 
 _under_way: set[tuple[str, str]] = set()
 """Controls into which this process is pushing, by database and control (by name if no address is given)."""

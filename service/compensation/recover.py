@@ -287,7 +287,7 @@ async def recovered_session(
 
 
 LIMIT_S = 600.0
-"""How long a command waits by default."""
+"""Default limit of a command's wait, s."""
 POLL_S, REMIND_S, RETRY_S = 0.1, 30.0, 2.0
 """Interval of looks at the controller; interval of reminders to a person; pause after the controller has refused a rollback."""
 
