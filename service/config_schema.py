@@ -285,7 +285,7 @@ class Calibration(ConfigTable):
         return {kind: day for kind, day in days.items() if day is not None}
 
     def identities(self) -> dict[str, str]:
-        """What is stated of each instrument and its certificate."""
+        """The stated facts about each instrument and its certificate."""
         known = {"ballbar": self.ballbar_is, "laser": self.laser_is, "artefact": self.artefact_is}
         return {kind: text for kind, text in known.items() if text}
 
@@ -432,7 +432,7 @@ class Signatures(ConfigTable):
 
 
 class AlarmSection(ConfigTable):
-    """When scheduled checks raise an alarm before a limit is exceeded, and the reactions that the service may start by itself."""
+    """Conditions for an alarm of scheduled checks before a limit is exceeded, and reactions that the service may start by itself."""
 
     warn_days: float = Field(
         default=14.0,
