@@ -139,7 +139,7 @@ class JobRegistry:
         self.claim, self._tasks = claim, tasks
 
     async def close(self) -> None:
-        """Accept no more jobs, and cancel those started by hand, which stops the axes."""
+        """Accept no more jobs, and cancel the jobs started by hand; their cancellation stops the axes."""
         self.claim = None
         running = [entry.task for entry in self._jobs.values() if entry.task is not None and not entry.task.done()]
         for task in running:
@@ -208,7 +208,7 @@ class JobRegistry:
 
     @property
     def running(self) -> JobState | None:
-        """The running job, with the state of its measurement; None: none."""
+        """The running job, with the state of its measurement; None: no job runs."""
         return None if self._now is None else self._state_of(self._now)
 
     def latest(self) -> tuple[JobState, ...]:

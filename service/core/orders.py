@@ -138,7 +138,8 @@ RetryingLook = Callable[[Look], Awaitable[JobOutcome | None]]
 
 
 class _TableOrderJob(_OrderJob):
-    """An order for the tables; its outcome is read from the push journal. ``retrying(look)``: looks until the database answers."""
+    """An order for the tables; its outcome is read from the push journal. ``retrying(look)``: repeats ``look`` until the database
+    answers."""
 
     def __init__(self, kind: JobKind, recipe: str, trail: _AuditTrail, act: Action, look: Look, retrying: RetryingLook) -> None:
         super().__init__(kind, recipe, trail, act)

@@ -38,7 +38,7 @@ Recover = Callable[[], Awaitable[str | None]]
 
 
 IsOpen = Callable[[], Awaitable[bool]]
-"""Returns whether the machine's last push is open by its journal, which includes a push under way and one that needs a person."""
+"""Returns whether the push journal shows the machine's last push as open; a push under way, or one that needs a person, is open, too."""
 
 
 class PushRecovery:

@@ -93,7 +93,8 @@ AGAIN_S = 1.0
 """Time after which a first difference is checked again, s: another process's push may have ended between two readings."""
 CODE = STRANGE_TABLE_CODE
 REMEDY = "find out who wrote it; restore the right table, or have this one accepted if it is right (abbe accept-table -m MACHINE.toml)"
-"""What to do about an unknown table. Not a rollback or a push: both are refused while it is active (`abbe.service.tables.table_gate`)."""
+"""Remedy for an unknown table. Rollback and push are no remedy: they are refused while the table is active
+(`abbe.service.tables.table_gate`)."""
 
 
 class TableWatch:
@@ -117,7 +118,7 @@ class TableWatch:
         self._look, self._alarms, self._attention = look, alarms, attention
         self._clock, self._changed = clock, changed
         self._first: int | None = None
-        """CRC expected while the journal has none: that of the first table found without a problem."""
+        """CRC expected while the journal states none: the CRC of the first table found without a problem."""
         self._reported: tuple[int, str] | None = None
 
     async def run(self) -> None:

@@ -240,8 +240,7 @@ class WebProcess:
         return child
 
     async def _end(self, child: asyncio.subprocess.Process) -> None:
-        """Wait for the end of the process, whose channel has closed; kill it after `GOODBYE_S`, since it holds nothing that could be
-        lost."""
+        """Wait for the end of the process, whose channel has closed; kill it after `GOODBYE_S`: it holds nothing that could be lost."""
         if self._up:
             with suppress(TimeoutError):
                 async with asyncio.timeout(GOODBYE_S):
