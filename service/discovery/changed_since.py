@@ -125,7 +125,7 @@ def _acting(tables: Sequence[RunTable]) -> int | None:
 
 
 def _tables_between(store: Store, campaign: Campaign, before: _Before) -> RemovedTable | None:
-    """Return what to subtract from the readings to get those with the earlier table; None if both tables are the same.
+    """Return the effect to subtract from the readings so that they are as with the earlier table; None if both tables are the same.
 
     Raises
     ------

@@ -52,8 +52,8 @@ class DiscoveryJob:
     runs, and effects that decimation hides. ``thinning``: the decimation in numbers, None without any. ``since``: the solution to compare
     with.
 
-    ``expected_version``: the version that must still be the current one when this discovery adds its own: the newest at its start, or the
-    one added by the discovery that it continues.
+    ``expected_version``: version that must still be current when this discovery adds a version: the newest at its start, or the version
+    that the continued discovery added.
     """
 
     campaign: Campaign
@@ -87,7 +87,7 @@ class DiscoveryJob:
 
 
 def _without_artefacts(campaign: Campaign) -> tuple[Campaign, list[str]]:
-    """Leave out points of artefacts: a solution of the poses separates errors of the part from those of the machine."""
+    """Leave out points of artefacts: only a solution of the poses separates errors of the part from errors of the machine."""
     artefacts = [r.run_id for r in campaign.runs if r.is_artefact]
     if not artefacts:
         return campaign, []

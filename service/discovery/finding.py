@@ -129,7 +129,7 @@ def _run(found: Discovery, run: CaseRun) -> RunResidual:
 
 
 def noise_mm_of(noise_mm: Mapping[str, float], kind: str) -> float:
-    """Return the noise of one reading of an instrument, mm; that of the noisiest instrument if none of its runs was fitted."""
+    """Return the noise of one reading of an instrument, mm; if none of its runs was fitted, the noise of the noisiest instrument."""
     return noise_mm.get(kind, max(noise_mm.values()))
 
 
