@@ -75,8 +75,7 @@ class FoundTest(FileObject):
 
 
 class FoundAgreement(FileObject):
-    """Test of a run that was never fitted. ``times``: ratio of its rms to the allowed rms; ``p``: probability of so large an rms by
-    chance."""
+    """Test of a run that was never fitted. ``times``: its rms over the allowed rms; ``p``: probability of so large an rms by chance."""
 
     run: str
     times: float = Field(ge=0)
@@ -193,7 +192,7 @@ class StandstillShift(FileObject):
 
 
 class StandstillFile(FileObject):
-    """What the temperatures explain of the displacement of a machine at standstill (ISO 230-3).
+    """The part of a machine's displacement at standstill that temperatures explain (ISO 230-3).
 
     ``runs``: fitted runs in order of time. ``covered``: share of readings within U (k = 2) in runs left out. ``model``: the better
     predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: of runs that were not fitted.

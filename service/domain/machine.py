@@ -1,4 +1,4 @@
-"""A machine: the ``machine`` object of the exchange format with its types, which the machine file shares, and the addresses of its devices.
+"""A machine: the ``machine`` object of the exchange format, the types that it shares with the machine file, and the addresses of devices.
 
 Nothing here connects to a device.
 """

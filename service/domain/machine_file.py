@@ -1,4 +1,4 @@
-"""What the machine file states, with the line of each value: for the screen that shows it, since the page cannot change it."""
+"""The values that the machine file states, with their lines, for the screen that shows them; the page cannot change them."""
 
 from __future__ import annotations
 

@@ -185,7 +185,7 @@ class RunTable:
 
     @property
     def acting_crc(self) -> int | None:
-        """CRC of the table, None if there was none, or if it did not act."""
+        """CRC of the table; None if there was no table, or if it did not act."""
         return None if self.acting is False else self.crc
 
 
@@ -214,7 +214,7 @@ class RunStart:
 
     @classmethod
     def from_document(cls, doc: Doc) -> Self:
-        """Parse a start document; what is missing is empty or zero."""
+        """Parse a start document; missing fields are empty or zero."""
         imported: Doc | None = doc.get("imported")
         path = doc.get("path")
         return cls(

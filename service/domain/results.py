@@ -65,7 +65,8 @@ class ModelRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True)
 class NewVersion:
-    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: there is none yet."""
+    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: the model has no version
+    yet."""
 
     machine: str
     after: int | None

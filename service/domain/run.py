@@ -201,8 +201,8 @@ class BarSetup(Setup):
     """Mounting of a ball-bar: the cup's centre, the bar, and the path about it.
 
     ``turns``: number of turns of a helix; ``plane``, ``span_deg``: plane and covered angle of a circle; ``opens``: side of the pole on
-    ``axis``, where the spindle is; ``samples``: of a reading at standstill, None for a continuous path. ``law``, ``even``, ``chord_mm``,
-    ``rate_hz``: further values to repeat the same path.
+    ``axis``, where the spindle is; ``samples``: number of samples of a reading at standstill, None for a continuous path. ``law``,
+    ``even``, ``chord_mm``, ``rate_hz``: further values to repeat the same path.
     """
 
     centre_mm: Vector

@@ -156,7 +156,7 @@ class BudgetLineValue(FileObject):
 
 
 class WithoutScale(FileObject):
-    """The map without the scales that are the largest part of its uncertainty: the common one, or that of each axis.
+    """The map without the scales that are the largest part of its uncertainty: the common scale, or the scale of each axis.
 
     ``error_um``: rms of the deviation; ``rms_um``: of its standard uncertainty; ``expanded_vector_um``: 95 % at the worst point.
     """
@@ -258,7 +258,8 @@ class LostMotion(FileObject):
 
 
 class TableRemoval(FileObject):
-    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used for that."""
+    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used for the
+    subtraction."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]
