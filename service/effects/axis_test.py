@@ -138,7 +138,7 @@ def _drift_at(drift: RepeatDrift, t_s: F1) -> tuple[F1, F1]:
 
 
 def _predicted(run: CaseRun, place: F1, level: F1, drift: tuple[F1, F1] | None) -> F1:
-    """Return the mean at the same place in the fitted runs plus the drift, if any, extrapolated linearly after them."""
+    """Return the mean of the fitted runs at the same place plus the drift, if any, which is extrapolated linearly after these runs."""
     means = {p: float(level[place == p].mean()) for p in np.unique(place)}
     fallback = float(level.mean())
     out = np.array([means.get(p, fallback) for p in places_of(run)])

@@ -16,7 +16,8 @@ from abbe.service.errors import ModelUnknown
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 ALIKE = 2.0
-"""Values of a non-linear parameter that differ by fewer standard uncertainties than this count as equal, and so do their columns."""
+"""Largest difference between values of a non-linear parameter, in standard uncertainties, at which the values, and their columns, count
+as equal."""
 OPPOSITE = -0.8
 """If the cosine between two findings' coefficients is below this, the later finding reverses the earlier one; otherwise it is another
 change."""
