@@ -285,7 +285,8 @@ class _Builder:
         self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
-        """Combine products with own-axis tables and the cross tables of ``pairs`` (axis, output), which correct what the products leave."""
+        """Combine products with own-axis tables and the cross tables of ``pairs`` (axis, output), which correct the errors that the
+        products leave."""
         fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
         own = _own(self.known, self._control, tuple(t for t in fine if t.own))
         cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)

@@ -26,7 +26,7 @@ class TextFile:
     error: type[AbbeError] = TableFileError
 
     def lines(self) -> Iterator[tuple[int, str]]:
-        """Return the lines with their numbers, from 1; they end with LF, CRLF or CR."""
+        """Return the lines with their numbers, from 1; a line ends with LF, CRLF or CR."""
         return enumerate((text.removesuffix("\n") for text in io.StringIO(self.text, newline=None)), start=1)
 
     def wrong(self, line: int, what: str, remedy: str = "correct the file; nothing was loaded") -> AbbeError:

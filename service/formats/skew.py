@@ -3,8 +3,8 @@
 Marlin and Klipper command x − y·xy − z·(xz − xy·yz) and y − z·yz (both sources alike: Marlin planner.h, Klipper skew_correction.py): a
 factor is the deviation of an axis for a unit of travel of another, +e. Klipper takes it as three lengths of a figure with sides of 100
 mm: diagonals AC and BD, side AD. Lost motion: M425 of Marlin (needs BACKLASH_GCODE) and $160 to $162 of grblHAL (needs a build with
-ENABLE_BACKLASH_COMPENSATION); Klipper compensates no lost motion, grblHAL no skew. Zero is the machine's own zero: another one shifts
-the whole map.
+ENABLE_BACKLASH_COMPENSATION); Klipper compensates no lost motion, grblHAL no skew. Zero is the machine's own zero: another zero would
+shift the whole map.
 """
 
 from __future__ import annotations
