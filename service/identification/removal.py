@@ -55,7 +55,7 @@ class RemovedTable:
 
 @dataclass(frozen=True)
 class CampaignTable:
-    """The table that a campaign was measured with; None if none acted, or if it cannot be removed (``why``)."""
+    """The table that acted while a campaign was measured; None if no table acted, or if it cannot be removed (``why``)."""
 
     table: NineTables | None = None
     why: str = ""
