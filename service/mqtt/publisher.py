@@ -60,7 +60,7 @@ class MessageSource(Protocol):
         ...
 
     async def tidy(self) -> int:
-        """Delete old delivered messages; return how many waiting messages had to be dropped because too many wait."""
+        """Delete old delivered messages; return how many waiting messages were dropped because too many waited."""
         ...
 
 
