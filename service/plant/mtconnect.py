@@ -66,7 +66,8 @@ class Observation:
 
 
 class Agent:
-    """Buffer of observations of one machine, numbered from 1 without gaps. ``instance``: ``instanceId``, another one after each start."""
+    """Buffer of observations of one machine, numbered from 1 without gaps. ``instance``: the ``instanceId``, a new number after each
+    start."""
 
     def __init__(self, instance: int, buffer: int = BUFFER) -> None:
         self._instance, self._size = instance, buffer
