@@ -88,7 +88,7 @@ def _arrived(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _switch(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> Operation:
-    """The new table is active, or an exchange was interrupted and none acts: bring the old one back."""
+    """Bring the old table back: the new table is active, or an exchange was interrupted and no table acts."""
     truth = known.start
     assert truth is not None
     if truth.unsafe:
@@ -154,7 +154,7 @@ def _with_old_bank(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operatio
 
 
 def _with_table_off(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
-    """A control with one table was interrupted while tables were exchanged: restore the old one, unless its table holds foreign content."""
+    """Restore the old table of a control with one table after an interrupted exchange, unless its table holds foreign content."""
     step = bracket(known, truth.active, min(len(f.image), len(f.base_image)) // 2, again=False)
     if isinstance(step, Operation):
         return step
@@ -167,7 +167,7 @@ def _with_table_off(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operati
 
 
 def _mixed(content: bytes, images: tuple[bytes, bytes], size: int) -> bool:
-    """Whether each chunk of a table is that of the new or of the old one."""
+    """Whether each chunk of a table equals that of the new or of the old table."""
     return bool(content) and all(
         content[at : at + size] in [i[: len(content)][at : at + size] for i in images] for at in range(0, len(content), size)
     )
@@ -184,7 +184,7 @@ def _begin_restaging(truth: Truth, bank: int) -> Operation:
 
 
 def _ours(content: bytes, base: bytes, size: int) -> bool:
-    """Whether each chunk of a bank is either that of the old table or still blank (zeros)."""
+    """Whether each chunk of a bank equals that of the old table or is still blank (zeros)."""
     chunks = [(content[at : at + size], base[at : at + size]) for at in range(0, len(base), size)]
     return len(content) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 

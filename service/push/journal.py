@@ -305,7 +305,7 @@ class StoreBook:
 
     @classmethod
     async def for_acceptance(cls, store: Store, machine: str, clock: Clock, control: str = "") -> StoreBook:
-        """Journal for a person's acceptance of the table in force: that of the last push, or `NO_PUSH` before the first."""
+        """Journal for a person's acceptance of the table in force: the journal of the last push, or `NO_PUSH` before the first push."""
         chain = await asyncio.to_thread(store.pushes.chain, machine, control)
         return await cls.of_chain(store, chain, clock) or cls(store, chain, clock, NO_PUSH, GENESIS, ())
 
@@ -392,7 +392,7 @@ NEEDS_ATTENDANCE = (
 
 
 def objection(level: int, *, attended: bool) -> str:
-    """Why a push is not allowed at this level; empty if it is."""
+    """Return the reason why a push is not allowed at this level; empty if it is allowed."""
     if level >= 3:
         return ""
     if level in (1, 2):

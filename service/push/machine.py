@@ -177,7 +177,7 @@ def _arm(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _changed(f: PushFacts, truth: Truth, gen: int) -> str:
-    """Why the snapshot no longer holds; empty if it does."""
+    """Return the reason why the snapshot no longer holds; empty if it holds."""
     if truth.boot != f.boot:
         return "the controller restarted"
     if truth.map != f.map:
@@ -235,7 +235,8 @@ def _unconfirmed(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _not_in_force(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
-    """End the push: the old table acts. A new one that the control laid aside for its next start is discarded: it would act unverified."""
+    """End the push: the old table acts. A new table that the control laid aside for its next start is discarded: it would act
+    unverified."""
     if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
     if known.forgets:

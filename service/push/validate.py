@@ -120,7 +120,7 @@ class EvidenceSeal:
 
 @dataclass(frozen=True, slots=True)
 class Candidate:
-    """A proposed table. ``base_crc``: CRC of the table in force during the measurement, the only one that it may replace."""
+    """A proposed table. ``base_crc``: CRC of the table in force during the measurement, the only table that the candidate may replace."""
 
     machine: str
     map_version: int
@@ -279,14 +279,14 @@ def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Itera
 
 
 def drift_reason(drift_mm: float, limits: PushLimits) -> str:
-    """Why the drift is too large, by the rms residual of the solution in a newer run; empty if it is not."""
+    """Return the reason why the drift (rms residual of the solution in a newer run) is too large; empty if it is not."""
     if drift_mm <= limits.drift_mm:
         return ""
     return f"DRIFT: a newer run deviates from the solution by {drift_mm * 1e3:.1f} µm rms, allowed are {limits.drift_mm * 1e3:.1f} µm"
 
 
 def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushLimits) -> str:
-    """Why the predicted improvement is too small to write a table; empty if it is not.
+    """Return the reason why the predicted improvement is too small to write a table; empty if it is large enough.
 
     ``before_mm``, ``after_mm``, ``u_mm``: predicted rms without and with the table, and the model's standard uncertainty.
     """
@@ -298,7 +298,7 @@ def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushL
 
 
 def _policy(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Limits of unattended pushes only: minimum interval, and drift of the tables over 30 days."""
+    """Yield the reasons of limits that hold only for unattended pushes: minimum interval, and drift of the tables over 30 days."""
     if context.attended:
         return
     if context.now_s - context.last_push_s < limits.unattended_h * 3600.0:
@@ -407,7 +407,7 @@ def _reverse(column: Column) -> Iterator[str]:
 
 
 def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Iterator[str]:
-    """Predict the residuals with the new table from those measured with the one in force."""
+    """Predict the residuals with the new table from the residuals measured with the table in force."""
     values = [x for column in c.columns for x in column.correction_mm]
     active = [x for column in c.columns for x in _active(column, context)]
     if values == active:
