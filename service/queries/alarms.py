@@ -1,4 +1,5 @@
-"""Alarms for people: their history with the person behind each entry, those of a check, and the way from an alarm to a signed report.
+"""Alarms for people: the history of each alarm with the persons behind it, the alarms of a check, and the way from an alarm to a signed
+report.
 
 The way (check, cause, proposal, approval, push, proof, report) follows from the store alone.
 """
