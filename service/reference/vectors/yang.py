@@ -111,7 +111,7 @@ def read_helix(case: VectorCase, checks: Checks) -> None:
 
 
 def _helix_readings(part: VectorCase, checks: Checks, truth: SixParameters, points: F2, origin: F1) -> None:
-    """Compare both readings of one set, and the fits of eq (9) to the exact one."""
+    """Compare the exact and the linear readings of one set, and the fits of eq (9) to the exact readings."""
     reading, radius = READINGS[part.text("z_reading")], part.number("R")
     d = points - origin
     nominal = d if reading == "workpiece" else workpiece_mm(d)
