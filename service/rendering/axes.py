@@ -101,7 +101,7 @@ class Panel:
         return [self.at(float(a), float(b)) for a, b in zip(x, y, strict=True)]
 
     def draw_line(self, svg: Svg, x: Floats, y: Floats, style: str) -> None:
-        """Line through data points, broken at missing ones."""
+        """Line through data points, broken at missing points."""
         svg.polyline(self.points(x, y), style)
 
     def draw_band(self, svg: Svg, x: Floats, low: Floats, high: Floats) -> None:

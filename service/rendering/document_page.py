@@ -39,7 +39,7 @@ FONTS_OF = {
 FONTS = (
     "/usr/share/fonts/opentype/noto", "/usr/share/fonts/truetype/noto", "/usr/local/share/fonts", str(Path(__file__).parent / "fonts"),
 )  # fmt: skip
-"""Where Debian's `fonts-noto-cjk`, people and `deploy/npm_files.py` put such fonts; `ABBE_FONTS` names another folder."""
+"""Folders into which Debian's `fonts-noto-cjk`, people and `deploy/npm_files.py` put such fonts; `ABBE_FONTS` names another folder."""
 NO_FONT = "Letters of this report have no font on this computer: install fonts-noto-cjk, or name a folder in ABBE_FONTS."
 IN_ENGLISH = (
     "This report is in English: its language ({lang}) has no font on this computer. Install fonts-noto-cjk, or run deploy/npm_files.py."

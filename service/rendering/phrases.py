@@ -33,7 +33,7 @@ _OWN_ENDS = {
     "ja": {". ": "。", ", ": "、", ".": "。", ", the ": "、", " and the ": "、", " or ": "、または"},
     "ko": {", the ": ", ", " and the ": ", ", " or ": " 또는 "},
 }
-"""How a language writes ends of sentences and parts; others write them as English does."""
+"""Ends of sentences and parts in a language; languages without entries use those of English."""
 
 
 @dataclass(frozen=True, slots=True)
