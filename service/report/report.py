@@ -226,7 +226,8 @@ def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict
 
 
 def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:
-    """At which temperature of the scales the new table holds: that of the runs it was computed from. Tables are not reduced to 20 °C."""
+    """Return the temperature of the scales at which the new table holds: that of the runs it was computed from. Tables are not reduced
+    to 20 °C."""
     solution_id = store.tables.get(known.table).solution_id if known.table else None
     if solution_id is None:
         return {}
@@ -283,8 +284,8 @@ NUMBERED = ("push", "discovery", "verification")
 
 
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:
-    """The report as a certificate of the laboratory in the rules, if they name one; ``measured_on``: day of the measurement, if the
-    report does not know it; ``issued``: day of issue."""
+    """The report as a certificate of the laboratory that the rules name, if any. ``measured_on``: day of the measurement, for a report
+    that does not know it; ``issued``: day of issue."""
     days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
     return replace(document, issuer=rules.issuer, item=rules.item, days=days, issued=issued.isoformat())
 
