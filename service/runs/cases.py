@@ -111,7 +111,7 @@ def _feed(run: Run) -> F1:
 
 
 def _driven_feed(q_mm: F2, t_s: F1, feed_mm_min: F1) -> F1:
-    """Return the stated feed, mm/min, or the one from positions and times if they disagree."""
+    """Return the stated feed, mm/min, or the feed from positions and times if the two disagree."""
     took_s = np.diff(t_s)
     if not took_s.size or not (took_s > 0.0).all():
         return feed_mm_min

@@ -153,7 +153,7 @@ def _follows(samples: BarSamples, k: int) -> bool:
 
 
 def sync_edges(samples: BarSamples, start: RunStart) -> Edges | None:
-    """Return the edges of the sync line in a run; None if no sample has it set."""
+    """Return the edges of the sync line in a run; None if no sample has the line set."""
     at = np.flatnonzero(_holds(samples, on_path))
     if not at.size:
         return None
