@@ -74,7 +74,7 @@ class Duties:
 
 @dataclass(frozen=True, slots=True)
 class AlarmChannels:
-    """Recipients of alarms: their topic (None: no broker), the callback that wakes the publisher, and the audit."""
+    """Recipients of alarms: the topic of their messages (None: no broker), the callback that wakes the publisher, and the audit."""
 
     topic: str | None
     posted: Callable[[], None]
@@ -233,7 +233,7 @@ class AlarmManager(RetryingStore):
         return await _Investigation(self, alarm, terms, look).told(progress, control)
 
     def _schedule_of(self, one: Alarm) -> Schedule | None:
-        """Return the schedule that raised an alarm; if it no longer exists, one of the same recipe."""
+        """Return the schedule that raised an alarm; if it no longer exists, another schedule of the same recipe."""
         same = [s for s in self._schedules if s.recipe == one.recipe]
         return next((s for s in same if s.name == one.schedule), next(iter(same), None))
 

@@ -17,7 +17,7 @@ from abbe.service.domain.schedule import Schedule
 
 
 class Hindrance(NamedTuple):
-    """Obstacle to the start of a slot: the state of the slot if it lasts too long, and a sentence."""
+    """Obstacle to the start of a slot: the state of the slot if the obstacle lasts too long, and a sentence."""
 
     state: str
     text: str
@@ -34,12 +34,12 @@ class Waiting:
 
     @property
     def grace_ends(self) -> datetime:
-        """When the grace period of the slot ends."""
+        """Time at which the grace period of the slot ends."""
         return self.slot + timedelta(seconds=self.schedule.grace_s)
 
     @property
     def until(self) -> datetime | None:
-        """When the slot is dropped; None: never, it will be caught up."""
+        """Time at which the slot is dropped; None: the slot is never dropped, but caught up."""
         return self.grace_ends if self.schedule.catch_up == "skip" else None
 
 
