@@ -161,7 +161,7 @@ async def follow(controller: Motion, control: Control, way: PathProgress | None 
 
 
 async def feed_hold(controller: Motion) -> None:
-    """Apply feed hold and wait until the axes stand: a real machine then brakes along its path, which an abort need not do."""
+    """Apply feed hold and wait until the axes stand: a feed hold lets a real machine brake along its path; an abort need not."""
     await controller.hold()
     until_s, last = asyncio.get_running_loop().time() + STAND_S, None
     while asyncio.get_running_loop().time() < until_s:

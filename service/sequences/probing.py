@@ -31,7 +31,7 @@ QUALIFIED_MM, COVERAGE = 0.002, 2.0
 factor of that uncertainty."""
 TOUCH_S = 30.0
 RESEAT_S, POLL_S = 1.0, 0.02
-"""How long a stylus may take to come back to rest after a touch (receivers report it late), and how often this is asked."""
+"""How long a stylus may take to come back to rest after a touch (receivers report it late), and the interval of looks at it."""
 SAME_PLACE_MM = 1e-5
 
 
@@ -173,7 +173,7 @@ class FeatureTouch:
             await self._protected(place)
 
     async def _protected(self, target: Point) -> None:
-        """Move where nothing may be touched. After one trip back off and try again: it may have been a false one."""
+        """Move where nothing may be touched. After one trip, back off and try again: the trip may have been false."""
         start = (await self.probe.status()).position_mm
         if math.dist(start, target) < SAME_PLACE_MM:
             return

@@ -198,11 +198,11 @@ class TestPlan:
     setup: AnySetup = field(hash=False)
     steps: tuple[Step, ...]
     artefact: Mapping[str, Any] = field(default_factory=dict, hash=False, repr=False)
-    """What is known of the artefact that is probed (`abbe.service.domain.artefact.ArtefactObject`), as in the campaign's document."""
+    """The known facts about the probed artefact (`abbe.service.domain.artefact.ArtefactObject`), as in the campaign's document."""
 
     @property
     def mounts(self) -> bool:
-        """Whether the test begins a set-up; else it uses that of an earlier test."""
+        """Whether the test begins a set-up; else it uses the set-up of an earlier test."""
         return any(isinstance(step, MountBar | MountLaser | MountArtefact) for step in self.steps)
 
     @property

@@ -152,7 +152,7 @@ class ArtefactTest(TestRecipe):
         )  # fmt: skip
 
     def _aside(self, touches: list[TouchFeature], machine: Machine) -> tuple[float, float, float]:
-        """Where the machine waits for the person: above the first feature, as far away from the artefact as the strokes allow."""
+        """Return where the machine waits for the person: above the first feature, as far from the artefact as the strokes allow."""
         up, place = np.array(touches[0].up), np.array(touches[0].above_mm)
         ends = np.where(up > 0.5, machine.stroke_mm[:, 1], np.where(up < -0.5, machine.stroke_mm[:, 0], place))
         return as_point(ends)
