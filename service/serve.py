@@ -63,7 +63,7 @@ JOURNAL_S = 0.25
 OpenPushReader = Callable[[], str]
 """Returns a sentence about the push that is still open, or an empty text if there is none."""
 STOP_S = 4.5
-"""Time from the stop signal until the process is ended by force, s: it must end within 5 s. The store survives that."""
+"""Time, s, from the stop signal until the process is ended by force; the service must end within 5 s. The store survives a forced end."""
 LEAVE_S = 0.3
 """Longest wait, s, for a thread that still computes after everything has closed."""
 WORK_END_S = 2.5
