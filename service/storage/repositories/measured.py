@@ -386,7 +386,7 @@ def require_running(connection: Connection, run_id: int) -> None:
 
 
 def _stored(connection: Connection, wanted: Sequence[ChunkRecord]) -> dict[tuple[str, int], ChunkRecord]:
-    """Stored chunks in the ranges of the wanted ones, by channel and number."""
+    """Return the stored chunks in the ranges of the wanted chunks, by channel and number."""
     found: dict[tuple[str, int], ChunkRecord] = {}
     for channel in {one.channel for one in wanted}:
         numbers = [one.seq for one in wanted if one.channel == channel]

@@ -14,7 +14,7 @@ from abbe.service.storage.tables import api_tokens, sessions, users
 
 _ACTIVE_ADMIN = (users.c.disabled_utc.is_(None), users.c.role == "admin", users.c.password.like("$argon2%"))
 FORGOTTEN = timedelta(days=30)
-"""Age at which the row of a session is deleted; it has ended long ago."""
+"""Age at which the row of a session is deleted; the session itself has ended long before."""
 
 
 class People(Repository):
