@@ -1,4 +1,4 @@
-"""What the push journals of a database know about tables: which were pushed, kept, accepted, or never verified.
+"""Knowledge about tables from the push journals of a database: which were pushed, kept, accepted, or never verified.
 
 Each table contains a random number, so its CRC identifies it: the CRC is looked up in all journals, under any machine name.
 """
@@ -41,7 +41,7 @@ class PushedTable:
 
 @dataclass(frozen=True, slots=True)
 class Endorsement:
-    """Why a table is valid on one control: a push kept it, a person accepted it, or the first push found it in force.
+    """Reason why a table is valid on one control: a push kept it, a person accepted it, or the first push found it in force.
 
     ``push``: 0 for an acceptance before the first push; ``by``: who accepted it, empty for no person.
     """
@@ -129,7 +129,7 @@ class _Crcs:
 
     @property
     def begun(self) -> tuple[int, int] | None:
-        """The table found in force and the one to be written, of the first entry of a push; None if it names none."""
+        """The table found in force and the one to be written, of the first entry of a push; None if the entry names no table."""
         if self.crc is None:
             return None
         if self.base_crc is None:

@@ -16,7 +16,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 
 KIND_AT, NO_CORRECTION = slice(4, 6), 0
-"""Where an image holds the kind of its table (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
+"""Place of the table's kind in an image (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
 REMEDY = "measure again without a table in force; or, if the control has Abbe's register map, add the tables with `abbe correct`"
 CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
 

@@ -27,7 +27,8 @@ NOTHING = "nothing was written"
 
 @dataclass(frozen=True, slots=True)
 class TableOrigin:
-    """Why a stored table was pushed: for a proposal (``proposal``; 0: none), or by a person's order (``order``: its number, ``reason``)."""
+    """Reason for the push of a stored table: a proposal (``proposal``; 0: none), or a person's order (``order``: its number,
+    ``reason``)."""
 
     kind: str = "push"
     proposal: int = 0
@@ -166,7 +167,7 @@ class JournalView:
         return facts(self._of(push))
 
     def origin(self, journal: Journal) -> TableOrigin:
-        """Why the table of a push was pushed."""
+        """The reason why the table of a push was pushed."""
         return self.origins.get(facts(journal).table, TableOrigin())
 
     @property
@@ -361,7 +362,7 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
 
 
 def reconciled(found: JobOutcome | None, reported: JobOutcome) -> JobOutcome:
-    """Correct a push's reported outcome by the one in the journal, ``found`` (None: no entry): the journal decides what is in force."""
+    """Correct a push's reported outcome by the journal's outcome ``found`` (None: no entry): the journal decides what is in force."""
     if found is None:
         return reported if reported.word in ("refused", STOPPED) else JobOutcome("failed", reported.text)
     if found.word == reported.word:
