@@ -61,7 +61,7 @@ class Passwords:
         return self._work(lambda: self._hasher.hash(password))
 
     def verify(self, kept: str | None, password: str) -> bool:
-        """Whether a password matches a hash; without a hash (unknown user) it does the same work."""
+        """Whether a password matches a hash. Without a hash (unknown user) the check does the same work."""
         password = password[: LONGEST_PASSWORD + 1]  # longer ones never match; do not hash them in full
 
         def work() -> bool:
