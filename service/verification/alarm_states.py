@@ -73,7 +73,8 @@ class AlarmHead:
 class Alarm(AlarmHead):
     """Present state of an alarm: the result of all entries in its history.
 
-    ``first``: signals of the check that raised it; ``last_seq``, ``judged_seq``: numbers of the last entry and of that of the last check.
+    ``first``: signals of the check that raised it; ``last_seq``, ``judged_seq``: numbers of the last entry and of the entry of the last
+    check.
     """
 
     number: int
@@ -111,7 +112,7 @@ Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """Return the effect of a check on ``now``, the alarm of its recipe or None; None if the check has no effect."""
+    """Return the effect of a check on ``now``, the alarm of its recipe (None: no alarm); None if the check has no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:

@@ -66,7 +66,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """Reference for a jump (value, standard uncertainty): that of ``terms.compare``, or the mean of few earlier checks, or None."""
+    """Reference for a jump (value, standard uncertainty): from ``terms.compare``, else the mean of few earlier checks, else None."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept
@@ -150,7 +150,7 @@ def active_alarm(store: Store, machine: str, recipe: str) -> Alarm | None:
 
 
 def series_begins(store: Store, machine: str) -> datetime | None:
-    """When the table in force came into force; earlier checks cannot be compared. None: Abbe has put no table into force.
+    """Time at which the table in force came into force; earlier checks cannot be compared. None: Abbe has put no table into force.
 
     A push that was rolled back does not begin a new series. Tables written by others are unknown here.
     """

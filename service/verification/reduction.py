@@ -45,7 +45,7 @@ class ScaleTemperature:
 
     @property
     def text(self) -> str:
-        """For a reader, with U (k = 2)."""
+        """The temperature as text, with U (k = 2)."""
         return f"{_pm(self.value_c, self.u_k)} °C"
 
 

@@ -141,8 +141,8 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
 
 
 def _reported_strange(store: Store, machine: str, journal: JournalView, checks: Sequence[VerificationRecord]) -> bool:
-    """Whether the last heartbeat of the machine's service reports a strange table, without a later change of table and without a later
-    check that found the expected one.
+    """Whether the last heartbeat of the machine's service reports a strange table, and since then neither the table changed nor a check
+    found the expected table.
     """
     heartbeat = store.heartbeats.of_machine(machine)
     if heartbeat is None or not strange_table(heartbeat.doc.get("attention") or []):
