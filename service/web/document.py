@@ -27,7 +27,7 @@ HEADERS = {
 KEPT = ("/static/", "/icon.svg", "/sw.js", "/manifest.webmanifest")
 """Content that is the same for all visitors: browsers may cache and revalidate it. They cache nothing else."""
 HSTS = "max-age=31536000"
-"""A year; sent only over TLS, and without effect for a page requested by address instead of by name."""
+"""One year. Sent only over TLS; browsers ignore it for a page requested by address instead of by name."""
 
 
 class SecurityHeaders:

@@ -97,7 +97,7 @@ def _is_screen(start: Message) -> bool:
 
 
 def _problem_in(start: Message, body: bytes) -> Doc:
-    """The problem document of a response; that of its text if a layer below us has answered with text."""
+    """The problem document of a response; if a lower layer has answered with text, a problem document with this text."""
     given = dict(start["headers"]).get(b"content-type", b"") == MEDIA_TYPE.encode()
     text = bytes(body if given else problem(int(start["status"]), body.decode("utf-8", "replace")).body)
     found: Doc = json.loads(text)

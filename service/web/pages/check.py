@@ -140,7 +140,7 @@ def _change(figure: CheckFigure, good: Verification | None, unit: str) -> tuple[
 
 
 def _curves(reader: Reader, check: Verification, good: Verification | None) -> tuple[list[RunRecord], list[Markup], str]:
-    """Runs of a check, and a picture of each over that of the last good check along the same path."""
+    """Return the runs of a check, each with a picture over the same run of the last good check."""
     try:
         runs, before = _runs(reader, check), [] if good is None else _runs(reader, good)
         now = [_loaded(reader, run, check.machine) for run in runs]

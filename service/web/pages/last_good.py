@@ -17,7 +17,7 @@ NO_SHAPE: Doc = {"check": None, "values": []}
 
 
 def last_good_shape(reader: Reader, recipe: str, label: str) -> Doc:
-    """Mean deviation, µm, in each of at most `PARTS` equal parts of a run of the last good check; no values where there is none."""
+    """Mean deviation, µm, in each of at most `PARTS` equal parts of a run of the last good check; empty without such a check."""
     good = last_good(latest_checks(reader, LOOK_BACK), recipe)
     if good is None or not good.campaign or label not in good.runs:
         return NO_SHAPE

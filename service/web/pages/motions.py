@@ -49,7 +49,7 @@ class MotionLine:
 
 @dataclass(frozen=True, slots=True)
 class RunLine:
-    """How one run shows the motion: change of its readings for 10 µm or 10 µrad, their noise, and its share of the information."""
+    """One run and its view of the motion: change of its readings for 10 µm or 10 µrad, their noise, and its share of the information."""
 
     label: str
     number: int

@@ -35,7 +35,7 @@ def add_result_pages(app: FastAPI, context: PageContext) -> None:
 
 
 async def _solution(context: PageContext, number: int | None) -> SolutionRecord | HTMLResponse | None:
-    """The requested solution or the newest; None: the store has none; a response if the requested one does not exist."""
+    """Return the requested or the newest solution; None if the store has none; a response if the requested solution does not exist."""
     if number is None:
         newest = await context.read(solution_lines, context.store, 1)
         if not newest:

@@ -96,7 +96,7 @@ LONG_RUN = 100_000
 
 
 def readings_of(store: Store, number: int) -> int:
-    """How many samples a run has in its database."""
+    """Number of samples of a run in its database."""
     return max((channel.samples for channel in store.chunks.channels(number)), default=0)
 
 

@@ -124,7 +124,7 @@ def _motions(stored: StoredField, take: Sequence[str]) -> list[EffectChoice]:
 
 
 def _refusal(choices: Sequence[EffectChoice], take: Sequence[str], translate: Translate) -> str:
-    """Why the selection has no forecast, in one line; empty if it has one."""
+    """Return the reason why the selection has no forecast, in one line; empty if it has one."""
     unknown = [name for name in take if name not in {c.name for c in choices}]
     if unknown:
         return translate("whatif.refused", names=", ".join(unknown), why=translate("whatif.unknown"))
