@@ -46,7 +46,7 @@ class BarSample(NamedTuple):
 class BarBatch:
     """Samples that arrived together. ``missing``: number of samples lost just before this batch, by their sequence numbers.
 
-    ``boot_id``: of the box that sent them. ``overran``: whether bytes were lost before them because this computer did not keep up.
+    ``boot_id``: boot id of the box. ``overran``: whether bytes were lost before these samples because this computer did not keep up.
     """
 
     host_s: float
@@ -57,7 +57,7 @@ class BarBatch:
 
 
 class BarTap(Protocol):
-    """Recorder of a stream: a thread of the driver passes it every sample before any consumer gets the sample."""
+    """Recorder of a stream. A thread of the driver passes every sample to the recorder before any consumer gets the sample."""
 
     def take(self, batch: BarBatch) -> None:
         """Take a batch, in order and exactly once. May block while the disk is slow: the driver buffers later samples. Never raises."""
@@ -165,7 +165,7 @@ class ProbeState:
 class Latch:
     """Axis position at which the probe tripped, and when, microseconds of the controller's clock.
 
-    ``period_s``: period at which the control looks at the probe; the trip was up to one period earlier. 0: the probe latches by itself.
+    ``period_s``: period at which the control reads the probe; the trip was up to one period earlier. 0: the probe latches by itself.
     """
 
     position_mm: Point
@@ -232,7 +232,7 @@ class DisplacementMeter(Protocol):
     """
 
     async def identify(self) -> DeviceInfo:
-        """Return kind, model and serial number; the serial number tells two devices apart."""
+        """Return kind, model and serial number; the serial number distinguishes two devices."""
 
     async def zero(self) -> None:
         """Make the present position 0. Raises DeviceFault where the device gives no valid reading."""
@@ -290,7 +290,7 @@ class Paths(Motion, Protocol):
 
 
 class Probing(Motion, Protocol):
-    """Moves that a touch probe ends. ``touch``: position at which it tripped, None if it reached the target without a trip."""
+    """Moves that a touch probe ends. ``touch`` returns the position of the trip, None if the probe reached the target without a trip."""
 
     async def probe_state(self) -> ProbeState: ...
     async def touch(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> Latch | None: ...
@@ -333,7 +333,7 @@ class OneBank(Protocol):
 
 
 class TableController(Identity, Tables, Protocol):
-    """The part of a controller that writing compensation tables needs: status and banks, but no motion."""
+    """The part of a controller that is needed to write compensation tables: status and banks, but no motion."""
 
 
 class Controller(Identity, Paths, Tables, Protocol):

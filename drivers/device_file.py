@@ -1,6 +1,6 @@
 """The device file: a TOML file that describes the protocol of one kind of device (docs/schemas/device-file.schema.json).
 
-It holds facts of the device's manual. What they prove is decided in `abbe.drivers.conformance`, not in the file.
+The file states facts of the device's manual. `abbe.drivers.conformance`, not the file, decides what these facts prove.
 """
 
 from __future__ import annotations
@@ -67,7 +67,7 @@ class DeviceTable(BaseModel):
 
 
 class DeviceValue(DeviceTable):
-    """One value: where it is found, and what a count of it means: value = sign * scale * count + offset, in ``unit``."""
+    """One value: its place in the protocol, and the meaning of a count: value = sign * scale * count + offset, in ``unit``."""
 
     address: Register | None = Field(default=None, description="Modbus: first register, from 0; a line's values are groups of its pattern")
     type: Type = Field(default="f64", description="Modbus: type; the text of a line is a decimal number")

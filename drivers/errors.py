@@ -1,4 +1,4 @@
-"""Errors of devices and links: each names device, operation, what happened, and a remedy. Also runs clean-up despite cancellation."""
+"""Errors of devices and links: each names device, operation, event and remedy. This module also runs clean-up despite cancellation."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ async def run_to_end(work: Coroutine[Any, Any, T]) -> T:
     Raises
     ------
     asyncio.CancelledError
-        After the end of the work, if the caller was cancelled during it: a cancellation is delayed, never swallowed.
+        Raised after the end of the work if the caller was cancelled meanwhile: a cancellation is delayed, never swallowed.
     """
     task = asyncio.ensure_future(work)
     interrupted: asyncio.CancelledError | None = None

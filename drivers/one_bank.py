@@ -1,4 +1,4 @@
-"""A control with one table, presented as a control with two banks (level 1), as a push needs them.
+"""Presents a control with one table as a control with two banks (level 1), because a push needs two.
 
 The table that acts is bank "active"; the other bank is memory of this process, where a new table is staged and read back while the old one
 acts. `OneBankTables.activate` switches compensation off, writes the table, reads it back in full and switches compensation on again. The
@@ -6,9 +6,9 @@ control itself refuses writes while its table acts, and refuses to switch on a t
 never acts. An interruption leaves compensation off; the push then restores the old table from its journal. A crash loses the staged
 table and the lease: they exist only in this process.
 
-Weaker than two banks (docs/decisions/0044-one-table.md): no table acts during the exchange; Abbe checks the interlocks before each switch,
-but the control does not check them at that instant; there is no lease, so no other program may write tables; if the origin of the content
-is unknown, a person must decide.
+This is weaker than two banks (docs/decisions/0044-one-table.md): no table acts during the exchange; Abbe checks the interlocks before each
+switch, but the control does not check them at that instant; there is no lease, so no other program may write tables; if the origin of the
+content is unknown, a person must decide.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ def image_in(store: bytes) -> bytes:
 
 
 class OneBankTables:
-    """The table calls of a `abbe.drivers.api.TableController` on a control with one table."""
+    """The calls of `abbe.drivers.api.TableController` about tables, on a control with one table."""
 
     def __init__(self, control: OneBank, *, chunk_words: int = CHUNK_WORDS) -> None:
         self._c, self._chunk = control, 2 * chunk_words
@@ -92,7 +92,7 @@ class OneBankTables:
         self._owner = 0 if self._owner == owner else self._owner
 
     async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
-        """Read the control's table (active bank) or the staged one; None: the image, as its header states it."""
+        """Read the control's table (active bank) or the staged one. ``n_bytes`` None: the whole image, as its header states its length."""
         whole = await self._c.read_table() if bank == self._active else bytes(self._staged or b"")
         return image_in(whole) if n_bytes is None else whole[2 * first : 2 * first + n_bytes]
 

@@ -1,15 +1,15 @@
-"""A control behind an OPC UA server: its position is read, and files are put into it and read. It moves nothing and holds no tables.
+"""A control behind an OPC UA server: its position and files are read, and files are written. It is not moved and has no tables here.
 
 A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the extra ``pip install 'abbe[opcua]'``. The URL names the nodes::
 
     opc.tcp://192.168.0.40:4840/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ&moving=ns%3D2%3Bs%3DMoving&unit=mm
 
-``moving`` (a Boolean node; optional) shows whether an axis moves. The unit is that of the nodes' EngineeringUnits (UNECE code); ``unit``
-(mm, um, m, in) states it for nodes without one, and must not contradict them. A value whose quality is not good is refused.
+``moving`` (a Boolean node; optional) shows whether an axis moves. The unit is that of the nodes' EngineeringUnits (UNECE code). ``unit``
+(mm, um, m, in) states the unit of nodes without EngineeringUnits, and must not contradict others. Values without good quality are refused.
 
-By default the session is anonymous and not encrypted: use that only in a network of the machine's own. ``certificate``, ``key`` (PEM,
-Abbe's) and ``server`` (the server's certificate, DER or PEM) encrypt it by Basic256Sha256; no other server is then accepted. ``user`` and
-``password_file`` log in.
+By default the session is anonymous and not encrypted: use such a session only in the machine's own network. ``certificate``, ``key`` (PEM,
+Abbe's) and ``server`` (the server's certificate, DER or PEM) encrypt the session by Basic256Sha256; no other server is then accepted.
+``user`` and ``password_file`` log in.
 """
 
 from __future__ import annotations
@@ -125,7 +125,7 @@ class OpcUaFiles:
         return frozenset(self._nodes)
 
     async def put(self, name: str, data: bytes) -> None:
-        """Write a file, erasing what it holds.
+        """Write a file and replace its content.
 
         Raises
         ------

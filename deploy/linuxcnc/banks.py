@@ -37,7 +37,7 @@ class Networks(Protocol):
     """The control's live correction networks."""
 
     def load(self, bank: int, network: Network) -> bool:
-        """Set the values of the network that does not act; return True if every value reads back."""
+        """Set the values of the network that is not active; return True if every value reads back."""
 
     def select(self, bank: int) -> bool:
         """Make a network act; return True if the control confirms it."""
@@ -53,7 +53,7 @@ class Banks:
     sets : TableSets
         Destination of tables that act after a restart.
     acting : list of int
-        Image whose files the running control read at its start; bank 0 begins with it.
+        Image of the files that the running control read at its start; first content of bank 0.
 
     Raises
     ------
@@ -126,8 +126,8 @@ class Banks:
     def activate(self, bank: int, owner: int, expected: tuple[int, int], *, may_act: bool, now_s: float) -> Result:
         """Make a sealed bank act if its CRC and the generation are the ``expected`` ones.
 
-        If the table's files differ from those that the control read at its start, it is only stored for the next start, and the result is
-        ``RESTART``.
+        If the table's files differ from those that the control read at its start, the table is only stored for the next start, and the
+        result is ``RESTART``.
         """
         refusal = self._refusal(bank, owner, now_s)
         if refusal:

@@ -21,7 +21,7 @@ class ControlGone(Exception):  # noqa: N818 - reads as what it is
 
 @dataclass(frozen=True)
 class Snapshot:
-    """The control at one instant. ``ready``: it executes nothing and no axis moves. Positions are commanded ones, mm."""
+    """State of the control at one instant. ``ready``: the control executes nothing and no axis moves. Positions are commanded ones, mm."""
 
     estop: bool
     drives_on: bool

@@ -1,7 +1,7 @@
 #!/usr/bin/python3
 """An operator without a screen: it releases the e-stop, switches the machine on, references all axes, then waits for TERM.
 
-``$ABBE_READY`` names a file that exists while the machine is referenced. With ``$ABBE_OPERATOR=absent`` it does nothing.
+``$ABBE_READY`` names a file that exists while the machine is referenced. With ``$ABBE_OPERATOR=absent`` this operator does nothing.
 """
 
 import os

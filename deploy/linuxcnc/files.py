@@ -24,7 +24,7 @@ class TablesAltered(Exception):  # noqa: N818 - reads as what it is
 def text_of(vertices: Vertices) -> str:
     """Return a COMP_FILE of type 1: triples of nominal, forward and reverse, mm; the last two are added to the command.
 
-    It has no header and no comment: the control stops reading at the first line that is no triple, without a message.
+    The file has no header and no comment, because the control stops reading, without a message, at the first line that is not a triple.
     """
     rows = vertices or ((0.0, 0.0), (_FAR_MM, 0.0))
     return "".join(f"{nominal:.5f} {value:.6f} {value:.6f}\n" for nominal, value in rows)

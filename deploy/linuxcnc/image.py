@@ -1,6 +1,6 @@
 """Convert compensation images (docs/protocols/cnc.md, "Banks") to the forms that this control supports: network curves and one-axis files.
 
-Nothing is approximated behind the host's back: an image that the control cannot reproduce is refused when it is sealed.
+No image is approximated: the control refuses, at sealing, an image that it cannot reproduce.
 """
 
 from __future__ import annotations
@@ -27,16 +27,16 @@ class ImageError(ValueError):
 
 @dataclass(frozen=True)
 class Plan:
-    """The form in which the control gets a table.
+    """Form in which the control receives a table.
 
     Attributes
     ----------
     kind : int
-        0, 1 or 2.
+        Kind of the image: 0 no correction, 1 one-axis tables, 2 grid.
     network : Network
         Content of the network that acts at once.
     files : dict
-        Axis -> vertices of its COMP_FILE (position mm, correction mm), which takes effect at the control's start; a missing axis has none.
+        Axis -> vertices of its COMP_FILE (position mm, correction mm), which takes effect at the control's start. Missing: no file.
     worst_lsb : float
         Largest difference, LSB, between a node of the image and the correction by the curves there.
     """
@@ -90,7 +90,7 @@ def plan(words: list[int]) -> Plan:
     Raises
     ------
     ImageError
-        The words are no image, or an image that 16-point curves and 256-point one-axis files cannot reproduce.
+        The words are not an image, or 16-point curves and 256-point one-axis files cannot reproduce the image.
     """
     table = _parse(words)
     if table.kind == 0:

@@ -1,7 +1,7 @@
 """The compensation network, made of the control's standard real-time components: its names, HAL text and parameters.
 
-Each of the two banks has a network of its own, and one bit (``abbe-bank``) selects the network that acts. So a new table is written and
-read back while the old one acts, and takes over in one servo period. Per bank and corrected axis ``i``::
+Each of the two banks has its own network, and one bit (``abbe-bank``) selects the active one. So a new table is written and read back
+while the old one is active, and then takes over within one servo period. Per bank and corrected axis ``i``::
 
     correction_i = sum over a of F_ai(q_a) + sum over pairs a != k, k != i of G_aki(q_a) q_k
 
@@ -40,7 +40,7 @@ class Network:
     levers : dict
         (a, k, i) -> vertices (position of a in mm, mm added to i per mm of k). Missing: zero.
     ends_mm : dict
-        Axis -> (low, high): positions beyond are taken as these ends.
+        Axis -> (low, high): a position beyond an end counts as this end.
     """
 
     shifts: dict[tuple[str, str], Vertices] = field(default_factory=dict)

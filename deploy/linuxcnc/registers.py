@@ -49,7 +49,7 @@ class RegisterMap:
     clock : Clock
         Controller time.
     boot_id : int
-        New at every start.
+        Boot id, new at every start.
     """
 
     def __init__(self, motion: Motion, banks: Banks, clock: Clock, boot_id: int) -> None:

@@ -289,7 +289,7 @@ class SerialBallBar:
         rate_hz : int
             Samples per second of device time; must divide 1000.
         tap : BarTap, optional
-            Takes every sample until the box has stopped, before the consumer and independent of its speed.
+            Recorder that gets every sample until the box has stopped, before the consumer and independent of the consumer's speed.
 
         Yields
         ------

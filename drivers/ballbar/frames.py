@@ -1,7 +1,7 @@
 """Encode and decode ball-bar frames (docs/protocols/ballbar.md), split received bytes into frames in a thread, match replies to requests.
 
 Decoding is pure and total: any bytes give frames or counted bad bytes, never an exception. Replies are matched by tag, so that a late reply
-never passes for that of another request.
+is never taken for the reply to another request.
 """
 
 from __future__ import annotations
@@ -135,7 +135,7 @@ def reading_text(settings: BoxSettings) -> str:
 class FrameDecoder:
     """Turns a byte stream, in pieces of any size, into frames.
 
-    Noise costs no good frame: if a check sum is wrong, the same bytes are searched again for a true frame.
+    No good frame is lost by noise: if a check sum is wrong, the same bytes are searched again for a valid frame.
     """
 
     def __init__(self) -> None:
@@ -188,7 +188,7 @@ class FrameDecoder:
 
 
 def _samples(data: bytes, at: int, out: list[Frame]) -> int:
-    """Append the SAMPLE frames that follow each other from ``at`` on to ``out``; return where they end. Fast path for a good line."""
+    """Append to ``out`` the SAMPLE frames that follow each other from ``at`` on; return the index after them. Fast path for a good line."""
     view = memoryview(data)
     whole = at + (len(data) - at) // _SAMPLE_BYTES * _SAMPLE_BYTES
     for head, seq, device_us, reading_nm, status, crc in _WHOLE_SAMPLE.iter_unpack(view[at:whole]):
@@ -223,8 +223,8 @@ _STOP_S = 2.0
 class BarCounters:
     """Diagnostic counters of the wire: valid frames, and errors, which never reach the data.
 
-    ``bad_frames``: with a wrong check sum. ``strays``: impossible samples (see `abbe.drivers.ballbar.stream`). ``lost``: samples missing
-    between others. ``overflow``: samples dropped because the consumer of a stream without a tap was too slow.
+    ``bad_frames``: frames with a wrong check sum. ``strays``: impossible samples (see `abbe.drivers.ballbar.stream`). ``lost``: samples
+    missing between others. ``overflow``: samples dropped because the consumer of a stream without a tap was too slow.
     """
 
     frames: int = 0
@@ -239,8 +239,8 @@ class BarCounters:
 class Framing:
     """A thread that turns the ring's bytes into frames until the ring ends, and updates the counters.
 
-    It makes these calls in the event loop: ``answered`` with each reply to a command, ``restarted`` with the stream and the reason when the
-    box restarts or changes its settings during a stream, ``broken`` with a defect that ended the thread.
+    The thread makes these calls in the event loop: ``answered`` with each reply to a command, ``restarted`` with the stream and the reason
+    when the box restarts or changes its settings during a stream, ``broken`` with a defect that ended the thread.
     """
 
     def __init__(

@@ -121,7 +121,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def rest(self) -> list[SampleRun]:
-        """Return the sample that is still a candidate (see `_weighed`) at the end of the stream: no further sample can judge it."""
+        """Return the sample that is still a candidate (see `_weighed`) at the end of the stream, because no further sample follows."""
         candidate, self._candidate = self._candidate, None
         runs: _Runs = []
         if candidate is not None:
@@ -266,7 +266,7 @@ class Stream:
         Raises
         ------
         SegmentEnd
-            The stream began anew, its pace changed, or the box's settings did. Only the samples before that are taken.
+            The stream began anew, or its pace or the box's settings changed. Only the samples before this event are taken.
         """
         with self._putting:
             if self._finished:

@@ -139,7 +139,7 @@ class Banks(ControllerSession):
         self._bank_commands = asyncio.Lock()
 
     async def comp_status(self) -> CompStatus:
-        """Read the compensation status, with boot id and generation verified as unchanged around it.
+        """Read the compensation status, and verify that boot id and generation were the same before and after it.
 
         Raises
         ------
@@ -239,9 +239,9 @@ class Banks(ControllerSession):
     async def _bank_command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
         """Send a command to the banks and determine its outcome.
 
-        If two programs use the same command number, the controller executes only the first command, but both see the acknowledge.
-        The owner of the lease shows whose command it was. A skipped command is sent again under another number, except ACTIVATE, where the
-        caller decides.
+        If two programs use the same command number, the controller executes only the first command, but both programs see the acknowledge.
+        The owner of the lease shows whose command was executed. A skipped command is sent again under another number, except ACTIVATE,
+        which is left to the caller.
         """
         async with self._bank_commands:
             for _ in range(1 if command == reg.ACTIVATE else _TRIES):
@@ -308,7 +308,7 @@ class Banks(ControllerSession):
 
 
 def _passed_over(command: int, result: int, counts: dict[str, int], fields: dict[str, int]) -> bool:
-    """Whether an acknowledge is for another program's command: it contradicts the lease's owner or, for SEAL, the bank's state."""
+    """Whether an acknowledge is for another program's command, because it contradicts the lease's owner or, for SEAL, the bank's state."""
     owner, holder = fields["owner"], counts["LEASE_OWNER"]
     if result == _LEASED:
         return holder == owner or (command == reg.LEASE and holder == 0)

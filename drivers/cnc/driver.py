@@ -35,8 +35,8 @@ class ModbusController(Banks):
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
         """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return that status.
 
-        On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, it sends a feed hold before
-        it raises the error.
+        On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, the driver sends a feed
+        hold before it raises the error.
 
         Raises
         ------

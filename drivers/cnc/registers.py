@@ -145,7 +145,7 @@ _MUST_BE_SET = {
 
 
 def fingerprint(counts: Mapping[str, int]) -> str:
-    """Describe the register map by the decoded identity block; two maps that differ give different texts."""
+    """Describe the register map by the decoded identity block; different maps give different texts."""
     return (
         f"map {counts['MAP_VER']}, {counts['N_AXES']} axes, table unit {counts['TABLE_LSB_NM']} nm, "
         f"bank of {counts['BANK_SIZE']} registers, FIFO of {counts['FIFO_SIZE']} points"

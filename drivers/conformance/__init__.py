@@ -1,1 +1,1 @@
-"""`abbe device test`: behaviour of a device, and of its driver with late, doubled, spoilt and missing replies."""
+"""`abbe device test`: test of a device, and of its driver with late, doubled, spoilt and missing replies."""

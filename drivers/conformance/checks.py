@@ -20,7 +20,7 @@ from abbe.drivers.errors import DriverError
 Ask = Callable[[str], Awaitable[object]]
 PASSED, FAILED, NOT_PROVED = CheckVerdict.PASSED, CheckVerdict.FAILED, CheckVerdict.NOT_PROVED
 SAMPLES = 10
-"""Least number of readings at rest, and least time over which they are taken, s."""
+"""Least number of readings at rest, and least time over which these readings are taken, s."""
 AVERAGED, SETTLED_S = 3, 0.3
 WATCHED_S = 1.0
 BUFFERED_S = 5.0
@@ -142,7 +142,7 @@ def _noise(taken: list[Sample], file: DeviceFile | None) -> list[DeviceCheck]:
 
 
 async def motion(probe: DeviceUnderTest, file: DeviceFile | None, move: Move, ask: Ask) -> list[DeviceCheck]:
-    """Have the target (or each axis) moved a known way and back: sign, scale, unit, byte order."""
+    """Have the target (or each axis) moved by a known distance and back; check sign, scale, unit, byte order."""
     found = []
     for name in probe.moved:
         try:
@@ -206,7 +206,7 @@ def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
 
 
 def _other_order(file: DeviceFile | None, name: str, words: tuple[tuple[int, ...], ...], move: Move) -> str:
-    """Name the byte order in which the registers would have read the motion; empty if there is none."""
+    """Name the byte order in which the registers would show the known motion; empty if there is none."""
     if file is None or file.modbus is None or not all(words):
         return ""
     value = file.values[name]

@@ -52,7 +52,7 @@ RECOVERS_S = 15.0
 """Longest time until a reading is right again."""
 PAUSE_S = 0.2
 AT_REST, NOISES = 10, 10.0
-"""Readings before the first fault, and by how many of their standard deviations a right reading may differ from their mean."""
+"""Readings before the first fault; largest difference of a right reading from their mean, in their standard deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -224,8 +224,8 @@ def _report(text: str, about: Described | None, role: str, info: DeviceInfo, fou
 def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
     """Return the abilities of a device by the findings of its test.
 
-    A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was, and if no check failed.
-    The test of a device file never proves motion or tables: only a driver and `abbe comp commission` do.
+    A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was proved, both only if no
+    check failed. The test of a device file never proves motion or tables: only a driver and `abbe comp commission` do.
     """
     if any(one.verdict is CheckVerdict.FAILED for one in found):
         return ()

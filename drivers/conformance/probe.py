@@ -1,4 +1,4 @@
-"""Devices of all kinds as one: numbered samples of named values, in mm or degree C."""
+"""One interface for devices of all kinds: numbered samples of named values, in mm or degree C."""
 
 from __future__ import annotations
 
@@ -153,7 +153,7 @@ class ControlProbe:
 
 
 class BarProbe:
-    """A ball-bar's stream; a sample is the newest that arrives after it was asked for."""
+    """A ball-bar's stream; a requested sample is the newest that arrives after the request."""
 
     moved: tuple[str, ...] = ("radius",)
 

@@ -35,7 +35,7 @@ U = TypeVar("U", bound=ModbusTcpUrl | ModbusRtuUrl | SerialUrl | SocketUrl)
 class Proxy:
     """Passes bytes between a driver and a device. ``late_s``: delay of a late reply.
 
-    A device behind TCP gets a TCP port of this computer in front of it, one behind a serial line a pseudo-terminal.
+    In front of a device on TCP the proxy opens a TCP port of this computer, in front of a serial device a pseudo-terminal.
     """
 
     def __init__(self, late_s: float) -> None:

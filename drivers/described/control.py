@@ -25,7 +25,7 @@ CONDITIONS = {
     "nc program": Condition.NC_PROGRAM,
 }
 STUCK_S = 0.5
-"""A counter is stuck if it stays the same for longer than ``update_s`` of the device file plus this time, s."""
+"""A counter is stuck if it does not change for longer than ``update_s`` of the device file plus this time, s."""
 UNKNOWN: Point = (float("nan"), float("nan"), float("nan"))
 """Position of a control that shows none."""
 
@@ -79,7 +79,7 @@ class ListenedControl:
             await self.source.close()
 
     def _check_renewed(self, snapshot: CountSnapshot) -> None:
-        """Refuse positions whose counter has not changed for longer than the device may show old values."""
+        """Refuse positions if their counter has not changed for longer than the device may show old values."""
         count = snapshot.counts.get("counter")
         if count is None or count != self._counted[0]:
             self._counted = (count, snapshot.host_s)

@@ -1,7 +1,7 @@
 """A described device that sends lines of text, when asked or by itself, over a serial port or TCP.
 
-A line has no number and seldom a check sum. So a late answer must never pass for the next one: after a disturbance the line has to be
-silent for a whole timeout, and unsolicited bytes are dropped before a request.
+A line of text has no number and seldom a check sum, but a late answer must never be taken for the next one. So after a disturbance the
+line has to be silent for a whole timeout, and unsolicited bytes are dropped before a request.
 """
 
 from __future__ import annotations
@@ -285,5 +285,5 @@ class StreamedLines(LineSource):
 
 
 def decoded(data: bytes) -> str:
-    """Return a line as text; a byte that is not ASCII becomes a character that no pattern for numbers accepts."""
+    """Return a line as text; bytes that are not ASCII become a character that no pattern for numbers accepts."""
     return data.decode("ascii", errors="replace").strip()

@@ -25,12 +25,12 @@ TENTH_NM_PER_MM = 1e7
 SOON_S = 10.0
 """A 16-bit counter of up to 1000 readings a second and more does not pass half of its range in this time."""
 NEW_S = 2.0
-"""Longest wait for a new reading; a device that shows an old one longer is stuck."""
+"""Longest wait for a new reading; a device that shows an old reading for longer is stuck."""
 ZEROED_MM = 0.05
 
 
 class DescribedMeter:
-    """A displacement sensor. `zero` sends the device's own command; without one, it subtracts the present reading from then on.
+    """A displacement sensor. `zero` sends the device's own command; if there is none, later readings are relative to the present one.
 
     A reading is new if the device's counter or time stamp has changed. For a device with neither, a reading of registers is new if it comes
     ``update_s`` (device file) after the last new one, and a line of text is always new.
@@ -87,12 +87,12 @@ class DescribedMeter:
         self._not_before = self._count
 
     async def clear_beam(self) -> None:
-        """Clear a latched loss, if the device has a command for that; errors as for `zero`."""
+        """Clear a latched loss of the beam, if the device has a command for it; errors as for `zero`."""
         if self.file.clear is not None:
             await self._command(self.file.clear, "clear")
 
     async def set_environment_compensation(self, on: bool) -> None:
-        """Send the command of the device file that switches the correction on; without one, do nothing.
+        """Send the command of the device file that switches the correction on; if there is none, do nothing.
 
         Raises
         ------

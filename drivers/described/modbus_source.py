@@ -65,7 +65,7 @@ class ModbusSource:
         return DeviceInfo(self._file.kind, self._file.name, "" if serial is None else f"{serial:.0f}", int(self._boot or 0), "")
 
     async def snapshot(self) -> CountSnapshot:
-        """Read all values. After a new connection the identity is compared first: it may be another device.
+        """Read all values. After a new connection the identity is compared first, because the device may be another one.
 
         Raises
         ------
@@ -91,7 +91,7 @@ class ModbusSource:
         Raises
         ------
         ReplyTimeout
-            It is not acknowledged.
+            The command is not acknowledged.
         LinkDown, BadFrame, Refused, DeviceFault
             Communication failed, or the device refused it.
         """

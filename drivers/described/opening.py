@@ -1,4 +1,4 @@
-"""Opens described devices: the wire from the URL, the rest from the device file; for a job only with tested abilities."""
+"""Opens described devices: the wire by the URL, the rest by the device file. For a job, only tested abilities count."""
 
 from __future__ import annotations
 

@@ -48,7 +48,7 @@ class DeviceCheck:
 
 @dataclass(frozen=True, slots=True)
 class TestReport:
-    """Report of a device test. ``device_sha256``: of the device file, empty for a device with a driver; ``utc``: ISO 8601."""
+    """Report of a device test. ``device_sha256``: hash of the device file, empty for a device with a driver; ``utc``: ISO 8601."""
 
     __test__ = False  # pytest takes names that begin with Test
     device: str
@@ -87,8 +87,8 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     Raises
     ------
     NotProved
-        There is no report, it is about another device or file, or it does not prove this ability; the message names the checks that failed
-        or are missing.
+        There is no report, or the report is about another device or file or does not prove this ability; the message names the checks that
+        failed or are missing.
     """
     remedy = untested_remedy(device)
     if not path:

@@ -110,7 +110,7 @@ class ModbusLaser:
         return DeviceInfo("laser", "LDDM", str(counts["SERIAL_NO"]), counts["BOOT_ID"], f"map {counts['MAP_VER']}")
 
     async def zero(self) -> None:
-        """Set the displacement to zero where the reflector stands now.
+        """Set the displacement at the present position of the reflector to zero.
 
         Raises
         ------
@@ -122,7 +122,7 @@ class ModbusLaser:
         await self._command(ZERO, 0, "zero")
 
     async def clear_beam(self) -> None:
-        """Clear the latch of a lost beam; needs a new ``zero`` afterwards.
+        """Clear the latch of a lost beam; a new ``zero`` is needed afterwards.
 
         Raises
         ------
@@ -206,7 +206,7 @@ class ModbusLaser:
         self._connection = self._link.connections
 
     async def _identity(self) -> dict[str, int]:
-        """Read and verify the identity block; repeated at every new connection, because the device may be another one."""
+        """Read and verify the identity block. This is repeated at every new connection, because the device may be another one."""
         counts = IDENTITY.counts(await self._link.read_block(IDENTITY))
         try:
             check_identity(self.name, counts, MAP_VERSION)

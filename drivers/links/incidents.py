@@ -1,6 +1,6 @@
-"""Incidents of a link as a readable list. An incident has two entries, detection and outcome, however many errors it consists of.
+"""Incidents of a link as a readable list. An incident has two entries, detection and outcome, for any number of errors.
 
-Also the wait before the next attempt at a lost link (`Backoff`).
+`Backoff` determines the wait before the next attempt at a lost link.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ _KEPT = 256
 class Incident:
     """One entry in the list of incidents.
 
-    ``kind``: ``detected`` or ``outcome``; ``code``, ``device``, ``run``, ``text``: of the first error; ``host_s``: monotonic host
+    ``kind``: ``detected`` or ``outcome``; ``code``, ``device``, ``run``, ``text``: those of the first error; ``host_s``: monotonic host
     seconds; ``state`` of an outcome: ``recovered`` (the device answers again), ``accepted`` (identified anew), ``closed``; ``times`` of an
     outcome: number of errors in the incident.
     """
@@ -40,7 +40,7 @@ class Incidents:
     """The latest incidents of one link, at most one of them open.
 
     ``listen`` is called with every entry and must not block or raise. ``run``: the run that the link serves now; errors without a caller
-    (heartbeat, pulled cable) belong to it, too.
+    (heartbeat, pulled cable) belong to this run, too.
     """
 
     def __init__(self, listen: Callable[[Incident], None] | None = None) -> None:
@@ -59,7 +59,7 @@ class Incidents:
     def note(self, error: DriverError, *, latched: bool = False) -> None:
         """Note an error, even if a retry overcame it. Only the first error of an incident makes an entry.
 
-        ``latched``: a good reply does not end the incident, because the device is another one or restarted: it must be identified anew.
+        ``latched``: a good reply does not end the incident, because another or a restarted device must be identified anew.
         """
         if error.run == NO_RUN:
             error.run = self.run
@@ -102,8 +102,8 @@ JITTER = 0.2
 class Backoff:
     """Waits between attempts: none, then 0.5 s, 1 s, 2 s ... 30 s, each with 20 % jitter, so that hosts do not retry in step.
 
-    A connection proves nothing, because a controller may accept and close: only ``succeeded`` resets the waits. At most eight attempts fall
-    into the first minute. ``clock``, ``sleep`` and ``draw`` (uniform in 0..1) can be replaced in tests.
+    A connection proves nothing, because a controller may accept and close it: only ``succeeded`` resets the waits. At most eight attempts
+    fall into the first minute. ``clock``, ``sleep`` and ``draw`` (uniform in 0..1) can be replaced in tests.
     """
 
     def __init__(

@@ -1,8 +1,8 @@
 """One Modbus connection, TCP or RTU: open it, send one request at a time, close it. The only file that uses pymodbus.
 
-Additions to pymodbus (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
-(`tcp_mismatch`, `rtu_mismatch`) before pymodbus gets it, closing of the old socket before a new one opens, and detection of unsolicited
-bytes.
+Differences from plain pymodbus (3.16.1): no hidden repetition of writes, no hidden reconnects, a comparison of every reply with its request
+(`tcp_mismatch`, `rtu_mismatch`) before pymodbus gets the reply, closing of the old socket before a new one opens, and detection of
+unsolicited bytes.
 """
 
 from __future__ import annotations

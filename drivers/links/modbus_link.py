@@ -27,7 +27,7 @@ class ModbusOperation(Enum):
     LEVEL = "level"
     """Writes a state, not an event (feed hold): idempotent."""
     NUMBERED = "numbered"
-    """A command that the device executes only with the next number, or data that are read back: a later read shows the outcome."""
+    """A command that the device executes only if it carries the next number, or data that are read back: a later read shows the outcome."""
     TRIGGER = "trigger"
     """Any other write: never repeated."""
 
@@ -101,16 +101,16 @@ def waits(op: ModbusOperation, code: int) -> bool:
 _BABBLE_LIMIT = 5
 _PROOFS = 5
 _CONNECT = 3
-"""Longest time for a TCP connection, in reply timeouts: a lost first packet is sent again only after a second."""
+"""Longest time for a TCP connection, in reply timeouts; it allows for a lost first packet, which is sent again only after a second."""
 
 
 @dataclass(frozen=True, slots=True)
 class Canary:
     """Registers with known content, which verify that replies come from this device and match their requests.
 
-    ``words``: content from ``address`` on; ``readable``: largest number of registers that one request may read from there. The number read
-    varies, because replies of different length cannot be confused. ``functions``: function codes that read any register with the same
-    result.
+    ``words``: content from ``address`` on; ``readable``: largest number of registers that one request may read from there. The number of
+    registers varies from read to read, because replies of different length cannot be confused. ``functions``: function codes that read any
+    register with the same result.
     """
 
     address: int = 0
@@ -123,7 +123,7 @@ class ModbusLine:
     """A Modbus wire that is verified after every disturbance.
 
     After a missing or wrong reply on RTU, the line waits for silence of a whole reply timeout and reads the canary before the next request.
-    It also reads the canary after every reply: if that reply was stale, the true one arrives in place of the canary and does not match.
+    It also reads the canary after every reply: if that reply was stale, the true reply arrives in place of the canary and does not match.
     Without a canary, an RTU line only waits for silence. ``timeout_s``: longest wait for one reply, s.
     """
 
@@ -162,9 +162,9 @@ class ModbusLine:
             await self._quarantine()
 
     def varied(self, request: Request, lead: int) -> tuple[Request, int]:
-        """Return the request to send now, and the number of extra registers that it reads before those asked for.
+        """Return the request to send now, and the number of extra registers that it reads before the requested ones.
 
-        On a line with a `Canary`, successive reads differ, so that a late reply to an earlier one is recognised: they alternate between
+        On a line with a `Canary`, successive reads differ, so that a late reply to an earlier read is recognised: reads alternate between
         functions 3 and 4 and start 0 to ``lead`` registers earlier.
         """
         if self._canary is None or request.function in WRITES:
@@ -219,7 +219,7 @@ class ModbusLine:
             await asyncio.sleep(left_s)
 
     async def _proven(self, canary: Canary, proof: int) -> bool:
-        """Whether the canary reads as in the first two reads of this connection, which were equal; identification checks its content."""
+        """Whether the canary reads as it did in the first two (equal) reads of this connection. Identification checks its content."""
         words = await self._read_canary(canary, proof)
         if words and self._known is None:
             self._known = words if await self._read_canary(canary, proof + 1) == words else None
@@ -253,10 +253,10 @@ class ModbusLink:
     timeout_s : float
         Longest wait for one reply; a TCP connection may take three times as long.
     canary : Canary, optional
-        For devices that have one and answer function 4 like function 3 (docs/protocols). Without it, a disturbed RTU line is not verified,
-        and there is no heartbeat.
+        For devices that have a canary and answer function 4 like function 3 (docs/protocols). Without one, a disturbed RTU line is not
+        verified, and there is no heartbeat.
     heartbeat_s : float, optional
-        Idle time until the canary is read (None: never): this detects a vanished peer within ``heartbeat_s + timeout_s``, and reconnects.
+        Idle time until the canary is read (None: never). This read detects a vanished peer within ``heartbeat_s + timeout_s``.
     """
 
     def __init__(
@@ -271,7 +271,7 @@ class ModbusLink:
         self.name = str(url)
         self.incidents = Incidents()
         self.connections = 0
-        """Number of connections so far: after a change the device may have restarted."""
+        """Number of connections so far; when it changes, the device may have restarted."""
         self._wire = ModbusWire(url)
         self._line = ModbusLine(self._wire, timeout_s, canary)
         self._canary = canary
@@ -327,9 +327,9 @@ class ModbusLink:
         return self._line.foreign_bytes
 
     async def read(self, address: int, count: int, *, lead: int = 0, function: int = READ_HOLDING) -> tuple[int, ...]:
-        """Read ``count`` (1..125) registers with one request, with one retry over a new or verified line.
+        """Read ``count`` (1..125) registers with one request; retry once over a new or verified line.
 
-        ``function``: 3 or 4; a link whose canary has both uses them in turn.
+        ``function``: 3 or 4; a link uses both in turn if its canary has both.
 
         ``lead``: registers before ``address`` that may be read, too. On RTU, the link reads a varying number of them and alternates
         functions 3 and 4, so that it recognises a reply to an earlier read.

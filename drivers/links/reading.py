@@ -1,5 +1,5 @@
-"""A thread that only reads bytes from a descriptor into a bounded ring, so that no busy loop, disk or solver lets the kernel's small buffer
-overflow.
+"""A thread that only reads bytes from a descriptor into a bounded ring, so that the kernel's small buffer does not overflow because of a
+busy loop, disk or solver.
 
 Bytes that do not fit into the ring are counted and reported as lost; ``Ring.on_mark`` warns before that.
 """

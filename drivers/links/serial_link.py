@@ -1,7 +1,7 @@
 """Bytes over a serial port or a raw TCP socket (the only file with pyserial).
 
-The event loop itself reads and writes: a cancelled read really ends, and an unplugged adapter is detected at once. Measurements use a
-reading thread instead (`start_reading`), so that a busy loop loses no byte.
+The event loop itself reads and writes, so that a cancelled read really ends and an unplugged adapter is detected at once. Measurements use
+a reading thread instead (`start_reading`), so that no byte is lost while the loop is busy.
 """
 
 from __future__ import annotations
@@ -112,7 +112,7 @@ _UNPLUGGED = "cable or adapter unplugged? check it, then try again"
 
 
 class ByteLink:
-    """A byte pipe to one device, which may return at another port.
+    """A byte pipe to one device, even if the device returns at another port.
 
     A serial port is locked: no second program (or link) can open it. An adapter with a serial number is found again at any port, and no
     other adapter is accepted instead; ``adapters`` returns the adapters now plugged in. ``bits``, ``stop``: data and stop bits of a
@@ -190,7 +190,7 @@ class ByteLink:
         return time.monotonic(), data
 
     def start_reading(self, ring: Ring, on_lost: Callable[[LinkDown], None]) -> None:
-        """Start a thread that reads every byte into ``ring`` until ``close``; ``read`` is not allowed during that.
+        """Start a thread that reads every byte into ``ring`` until ``close``; meanwhile ``read`` is not allowed.
 
         ``on_lost`` is called in the event loop when the device is lost; the port is closed then.
 

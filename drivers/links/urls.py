@@ -36,7 +36,7 @@ PARITIES = ("none", "even", "odd")
 
 @dataclass(frozen=True, slots=True)
 class Description:
-    """Files about a device whose protocol is not built in, as in the URL: its device file, and the report of ``abbe device test``."""
+    """Files, named in a URL, about a device whose protocol is not built in: its device file, and the report of ``abbe device test``."""
 
     device: str = ""
     tested: str = ""
@@ -197,7 +197,7 @@ _REPORT = re.compile(r"(?P<before>[?&])tested=(?P<path>[^&#]*)(?P<after>&?)")
 
 
 def split_report(text: str) -> tuple[str, str]:
-    """Return a URL without the report of its device's test, and the path of that report, empty without one."""
+    """Return a URL without the report of the device's test, and the path of this report; empty if there is none."""
     found = _REPORT.search(text)
     if found is None:
         return text, ""
@@ -212,7 +212,7 @@ def untested_remedy(text: str) -> str:
 
 
 def beside(text: str, folder: Path) -> str:
-    """Return a URL whose files (`Description`) are found from any working directory; relative ones lie in ``folder``."""
+    """Return a URL whose files (`Description`) are found from any working directory; relative paths refer to ``folder``."""
     if installed(text) is not None:
         bare, report = split_report(text)
         return f"{bare}{'&' if '?' in bare else '?'}tested={quote(str(folder / report))}" if report else text
@@ -226,7 +226,7 @@ def beside(text: str, folder: Path) -> str:
 
 
 def installed(text: str) -> EntryPoint | None:
-    """Return the driver of an installed package for a URL; None without one, or for a built-in scheme.
+    """Return the driver of an installed package for a URL; None if there is none, or for a built-in scheme.
 
     A driver is an entry point of the group ``abbe.drivers`` with the scheme as its name (`abbe.drivers.registry`). Nothing is loaded here.
     """

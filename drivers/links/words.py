@@ -1,6 +1,7 @@
 """Register maps as data, and the pure conversion from 16-bit words to integers (big-endian, high word first).
 
-Also what all devices with such a map share: registers that identify the map, and numbered commands with an acknowledge.
+This module also contains the common parts of all devices with such a map: registers that identify the map, and numbered commands with an
+acknowledge.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ _SIZE: dict[Kind, int] = {"u16": 1, "i16": 1, "u32": 2, "i32": 2, "u64": 4, "i64
 
 CANARY_I32 = 0x01020304
 CANARY_F32_BITS = 0x449A5000
-"""Bits of the float 1234.5 in two registers; compared as bits, so that any mistake in word or byte order shows."""
+"""Bits of the float 1234.5 in two registers. Bits are compared, so that any mistake in word or byte order shows."""
 CANARY_WORDS = (0x0102, 0x0304, 0x449A, 0x5000)
 """Both canaries in registers 0..3 of every device of docs/protocols."""
 
@@ -27,7 +28,7 @@ CANARY_WORDS = (0x0102, 0x0304, 0x449A, 0x5000)
 class Register:
     """One value of a register map.
 
-    ``address``: its first register, from 0; ``name``: as in docs/protocols; ``per_unit``: counts per ``unit``, so that the physical value
+    ``address``: first register, from 0; ``name``: name in docs/protocols; ``per_unit``: counts per ``unit``, so that the physical value
     is count / per_unit (a division keeps 0.01 steps exact to the last bit).
     """
 
