@@ -1,4 +1,4 @@
-"""Scenario (TOML): the simulated machine, how large its errors may be, and how its devices are reached."""
+"""Scenario (TOML): the simulated machine, the size of its errors, and the connections of its devices."""
 
 import dataclasses
 import tomllib
@@ -105,7 +105,7 @@ class HiddenConfig:
 
 @dataclass(frozen=True, slots=True)
 class ArtefactConfig:
-    """The plate that the fixture can put on the table. ``kind``: ``hole_plate`` or ``ball_plate``; sizes of the random draws beside."""
+    """The plate that the fixture can put on the table. ``kind``: ``hole_plate`` or ``ball_plate``; others: sizes of its random draws."""
 
     kind: str = "hole_plate"
     columns: int = 4
@@ -139,9 +139,9 @@ class SphereConfig:
 
 @dataclass(frozen=True, slots=True)
 class Scenario:
-    """Everything that decides how the simulated world behaves. Same scenario, same world, bit for bit.
+    """Everything that determines the simulated world. The same scenario gives the same world, bit for bit.
 
-    ``boot_id``: of the controller; 0: a new one at each start, as after switching the controller off and on.
+    ``boot_id``: boot id of the controller; 0: a new one at each start, as after switching the controller off and on.
     """
 
     seed: int = 1

@@ -55,7 +55,7 @@ def without_rigid_motion(points_mm: F, deviation_mm: F) -> F:
 
 
 def without_one_axis_functions(deviation_mm: F, nodes: int) -> F:
-    """Return what nine perfect one-axis tables would leave of deviations on a cubic grid, (nodes^3, 3) mm.
+    """Return the deviations on a cubic grid, (nodes^3, 3) mm, that would remain with nine perfect one-axis tables.
 
     The tables are the least-squares sum of one-axis functions: on a full product grid this is the mean plus the main effects.
     """

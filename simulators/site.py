@@ -109,7 +109,7 @@ class Site:
         await self._cnc.stop()
 
     def advance(self) -> None:
-        """Bring the world up to wall time. Called before every request; because this may start a motion, a tick follows at once."""
+        """Bring the world up to wall time. Called before every request; a tick follows at once, because the request may start a motion."""
         self._advance()
         if self._resting and self._ticking is not None:
             self._ticking.cancel()

@@ -52,7 +52,7 @@ class World:
     def advance(self, to_s: float) -> None:
         """Advance to an instant (s); an earlier one changes nothing.
 
-        On the way, it evaluates in order the instants of all bar samples, of the last laser sample, and those at which an axis may reverse.
+        On the way, the world evaluates in order the instants of all bar samples, of the last laser sample, and of possible reversals.
         """
         if to_s <= self.time_s:
             return

@@ -1,7 +1,7 @@
-"""A plate of holes or balls: its true form, how it grows and bends, and where it lies on the table.
+"""A plate of holes or balls: its true form, expansion and bends, and its pose on the table.
 
 Only one length of the plate is calibrated: its form and bends are unknown to the product. The plate fills the half space below its
-top, z = 0 of its own axes; holes go through it, balls stand on it.
+top, z = 0 of its own axes; holes go through the plate, balls stand on it.
 """
 
 from dataclasses import dataclass
@@ -77,7 +77,7 @@ class Mounting:
 
 
 def draw_mounting(config: ArtefactConfig, seed: int, number: int, pose: tuple[F, F], since_s: float) -> Mounting:
-    """Put the plate down as a person does: a few tenths of a millimetre and of a milliradian beside the stated pose, clamped by hand."""
+    """Put the plate down as a person does: a few tenths of a millimetre and of a milliradian off the stated pose, clamped by hand."""
     rng = generator(seed, STREAM_MOUNTING, number)
     origin, matrix = pose
     shift = np.array([0.15, 0.15, 0.02]) * rng.standard_normal(3)

@@ -1,6 +1,6 @@
 """The touch probe: a ball on a stylus that trips a little after it touches, later in some directions than in others (lobing).
 
-The pre-travel is the way from the ball's first touch to the trip. In a kinematic probe with three arms it repeats every 120 degrees. The
+The pre-travel is the travel from the ball's first touch to the trip. In a kinematic probe with three arms it repeats every 120 degrees. The
 noise of the trip is the repeatability.
 """
 
@@ -18,7 +18,7 @@ STREAM_STYLUS, STREAM_TRIPS = 22, 23
 @dataclass(slots=True)
 class Stylus:
     """The probe in the spindle. ``false_trips``, ``missed``: number of the next touches that trip falsely or not at all (tests);
-    ``broken``: it was driven into the material."""
+    ``broken``: whether the probe was driven into the material."""
 
     radius_mm: float
     pretravel_mm: float
@@ -31,7 +31,7 @@ class Stylus:
     broken: bool = False
 
     def trip_depth(self, way: F) -> float:
-        """Return how far beyond the first touch the probe trips when it approaches along the unit vector ``way``, mm."""
+        """Return the pre-travel, mm, for an approach along the unit vector ``way``."""
         flat = float(np.hypot(way[0], way[1]))
         lobes = self.lobing_mm * flat * np.cos(3.0 * np.arctan2(way[1], way[0]) + self.phase_rad)
         along = self.pretravel_mm * (0.35 + 0.65 * flat)

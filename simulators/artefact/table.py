@@ -63,7 +63,7 @@ class PlateUnderProbe:
         return bool(self.fitted and self._free(tip_mm[None, :], time_s)[0] < -0.5 * self.stylus.pretravel_mm)
 
     def contact(self, length_mm: float, way: F, tip: Tip, time_s: float) -> float | None:
-        """Return the length of a straight move, mm, after which the probe trips; None: it does not. ``way``: unit vector of the move."""
+        """Return the length of a straight move, mm, after which the probe trips; None without a trip. ``way``: unit vector of the move."""
         if not self.fitted:
             return None
         if self.stylus.false_trips:
@@ -76,7 +76,7 @@ class PlateUnderProbe:
         return found
 
     def crash(self, length_mm: float, tip: Tip, time_s: float) -> float | None:
-        """Return the length of a straight move, mm, after which the stylus breaks; None: it does not."""
+        """Return the length of a straight move, mm, after which the stylus breaks; None if it does not break."""
         return self._first_below(-CRASH_MM, length_mm, tip, time_s) if self.fitted else None
 
     def _first_below(self, level_mm: float, length_mm: float, tip: Tip, time_s: float) -> float | None:

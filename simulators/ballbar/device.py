@@ -1,4 +1,4 @@
-"""The ball-bar as a state machine: mounting, streaming, samples. No bytes; lengths in mm, samples in nm and µs as the box sends them."""
+"""The ball-bar as a state machine: mounting, streaming, samples. No bytes; lengths in mm, samples in nm and µs as sent by the box."""
 
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -24,7 +24,7 @@ class Conditions:
     """Measuring conditions: standard deviation of one reading (``*_noise_mm``), share and size of outliers, errors of the instruments.
 
     ``bar_length_sd_mm``: standard deviation of each bar's length error (one bar per nominal radius). ``wavelength_sd``: that of the laser's
-    relative scale error. ``pause_s``: between two runs. ``drift``: whether the machine's thermal drift acts.
+    relative scale error. ``pause_s``: time between two runs. ``drift``: whether the machine's thermal drift acts.
     """
 
     bar_noise_mm: float = 0.5e-3
@@ -87,7 +87,7 @@ class Rig:
         axes_mm : array, shape (n, 3)
             Commanded positions of the samples, in the order of the motion.
         centre_mm : array, shape (3,)
-            Nominal centre. The cup is set up there, unless ``cup_mm`` (from `cup`) is the position of one already set up.
+            Nominal centre. The cup is set up there, unless ``cup_mm`` (from `cup`) is the position of a cup that is already set up.
         t_s : array, shape (n,), optional
             Instants; None: 33 samples per second from now on.
         """
@@ -105,7 +105,7 @@ class Rig:
         axes_mm : array, shape (n, 3)
             Commanded positions of the records.
         beam : array, shape (3,)
-            Nominal beam, away from the laser. Beam and mirror are set up anew, each slightly misaligned.
+            Nominal beam, away from the laser. Beam and mirror are set up anew, both slightly misaligned.
         t_s : array, shape (n,), optional
             Instants; None: one record every 2 s from now on.
         """

@@ -99,7 +99,7 @@ def _lengths(vertices_mm: F) -> F:
 class Timetable:
     """An NC program under way, with the methods of `Motion`: positions at knots of program time, linear in between.
 
-    ``set_factor`` (feed hold, override) changes how fast program time runs, also in a dwell.
+    ``set_factor`` (feed hold, override) changes the speed of program time, also in a dwell.
     """
 
     def __init__(self, start_mm: F, blocks: list[tuple[F, float]], start_s: float) -> None:
@@ -229,7 +229,7 @@ class Controller:
         self.in_position = True
         self.in_position_s = 0.0
         self.motions_done = 0
-        """Number of motions finished since boot; `CncRegisters` derives from it whether its last command has finished."""
+        """Number of motions finished since boot; from this `CncRegisters` derives whether its last command has finished."""
         self.path_running = False
         self.path_start_s = 0.0
         self.path_end_s = 0.0
@@ -241,7 +241,7 @@ class Controller:
         self.probe_fitted: Callable[[], bool] = lambda: False
         self.deflected: Callable[[], bool] = lambda: False
         self.latch_mm: F | None = None
-        """Position at which the probe tripped in the last touch, None if it did not; ``latch_s``: when."""
+        """Position at which the probe tripped in the last touch, None without a trip; ``latch_s``: time of the trip."""
         self.latch_s = 0.0
         self._trip_mm: F | None = None
         self._crash = False

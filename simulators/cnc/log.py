@@ -25,7 +25,7 @@ class Command:
 class TableAccess:
     """One attempt to change a bank, the active table or the lease, as it arrived.
 
-    ``kind``: write, seal, activate, lease or release, or "stale" for a command ignored because its number was not the next one.
+    ``kind``: write, seal, activate, lease or release, or "stale" for a command that was ignored because its number was not the next one.
     ``bank``, ``first``, ``words``: bank, first register and words of a write; for a command, ``words`` are its number and its result
     (stale: its code). ``by``: owner named in the command, 0 for a write. ``taken``: whether the controller executed it. ``owner``: owner of
     the lease just before; ``active``, ``gen``: active bank and generation just after.

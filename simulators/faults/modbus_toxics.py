@@ -25,7 +25,7 @@ set_unit            the answer has unit ``value``; likewise set_tid, set_pid, se
                     set_address, set_count
 more_registers      the answer has ``value`` registers too many (below 0: too few) in an otherwise valid frame
 exception           exception code ``value`` instead of the answer; the device does not see the request
-exception_after     the same, but the device executes the request first
+exception_after     as ``exception``, but the device executes the request first
 black_hole          from here on nothing passes, but the connection stays open
 fin, rst            the connection is closed or reset instead of the answer; fin_before, rst_before: before the device sees the request
 ==================  ========================================================================================================

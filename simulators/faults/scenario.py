@@ -1,4 +1,4 @@
-"""Fault scenarios: which fault, when, how often, as plain data from TOML or a test. Each player (a proxy or line) defines its kinds.
+"""Fault scenarios: kind, time and number of faults, as plain data from TOML or a test. Each player (a proxy or line) defines its kinds.
 
 .. code-block:: toml
 
@@ -11,7 +11,7 @@
     times = 1                # how many in a row; 0: all from there on
     seconds = 0.3            # for kinds that wait
     value = 0                # for kinds that change something
-    on = "any"               # only events of this sort count, e.g. "read", "write"; the player says which sorts it knows
+    on = "any"               # only events of this sort count, e.g. "read", "write"; the player defines the sorts
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""A ball-bar's box on a bad line. It has its own time, which tests advance, so that they need not wait."""
+"""A ball-bar's box on a bad line. Tests advance the box's own time, so that they need not wait."""
 
 import asyncio
 from collections.abc import Callable
@@ -92,7 +92,7 @@ class FaultyBox:
         self.windows: list[Window] = []
         self.rate_factor = 1.0
         self.ppm = 0.0
-        """By how much the box's clock runs too fast, ppm."""
+        """Rate error of the box's clock, ppm; positive: too fast."""
         self.on_start: Callable[[], None] = lambda: None
         self.before: Callable[[int], bool] = lambda kind: False
         """Called with the type of every command; if it returns True, the box does not get the command."""

@@ -69,7 +69,7 @@ def burst(frame: bytes, draw: random.Random) -> bytes:
 
 
 def every_nth(frames: list[bytes], n: int, draw: random.Random) -> Iterator[bytes]:
-    """Yield all frames, every n-th of them (the n-th, the 2n-th ...) hit by a burst."""
+    """Yield all frames; a burst hits every n-th of them (the n-th, the 2n-th ...)."""
     for number, frame in enumerate(frames, 1):
         yield burst(frame, draw) if number % n == 0 else frame
 

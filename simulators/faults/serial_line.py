@@ -1,6 +1,6 @@
 """A serial line between the ball-bar's box and the host, which tests can unplug, stall and corrupt.
 
-`heard` simulates a serial receiver whose baud rate or parity differs from the sender's: it samples the bits at wrong instants.
+`heard` simulates a serial receiver with another baud rate or parity than the sender's, which samples the bits at wrong instants.
 """
 
 import asyncio

@@ -9,7 +9,7 @@ truncate    only the first ``value`` bytes arrive
 flip        bit ``value`` is flipped
 burst       two to six bytes in a row are changed
 drop        the frame does not arrive
-repeat      it arrives ``value`` times more
+repeat      the frame arrives ``value`` times more
 stall       this frame and all later bytes arrive together after ``seconds``
 unplug      the cable is pulled before the frame
 ==========  ==========================================================================================

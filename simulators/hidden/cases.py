@@ -40,7 +40,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return one column of readings for each function: it displaces the tool along one axis, and is zero while the cup is set up."""
+        """Return one column of readings per function. A function displaces the tool along one axis, and is zero while the cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:
@@ -223,7 +223,7 @@ def _per_setup(fitted: FittedRuns, kind: str) -> F:
 
 
 def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> list[str]:
-    """Return the labels of rivals that explain what is ``left`` (n,) of an effect down to a chi-square below `INDISTINCT`."""
+    """Return the labels of rivals that reduce the rest ``left`` (n,) of an effect to a chi-square below `INDISTINCT`."""
     labels, blocks = zip(*traces(fitted), strict=True)
     raw = np.hstack(blocks) * projector.weight[:, None]
     kept = projector.columns.T @ raw
@@ -260,7 +260,8 @@ BEYOND = ["second_tool_length", "single_axis_laser", "angular_interferometer", "
 class Visibility:
     """Visibility of an effect: rms in µm; ``snr_*`` and ``left`` (n,) in standard deviations of one reading.
 
-    All but ``raw_rms_um`` count only the part that the present model cannot absorb. ``share_touched``: share of readings that it touches.
+    All but ``raw_rms_um`` count only the part that the present model cannot absorb. ``share_touched``: share of readings that this part
+    touches.
     """
 
     raw_rms_um: float
@@ -331,7 +332,7 @@ def _filled(name: str, setting: Setting, runs: list[Run], names: list[str], rng:
 
 
 def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
-    """Return the effect; its place or time, if it has one, is moved into one of the runs, so that they can show it."""
+    """Return the effect with its place or time, if any, moved into one of the runs, so that the runs can show the effect."""
     run = runs[int(rng.integers(len(runs)))]
     at = int(rng.integers(run.track.n // 10, run.track.n - run.track.n // 10))
     if e.name == "local_bump":
@@ -348,7 +349,7 @@ def _located(rng: np.random.Generator, e: Hidden, runs: list[Run]) -> Hidden:
 def _sized(
     e: Hidden, wanted: float, perfect: PerfectMachine, runs: list[Run], model_projector: Projector
 ) -> tuple[Hidden, Visibility] | None:
-    """Scale an effect to the wanted ``snr_local`` within its physical limits; return it and its visibility, None if it leaves no trace."""
+    """Scale an effect to the wanted ``snr_local`` within its physical limits; return effect and visibility, None if there is no trace."""
     low, high = (CATALOGUE | OUTSIDE)[e.name][3]
     seen = visibility(e, perfect, runs, model_projector)
     if seen.raw_rms_um < 1e-6:

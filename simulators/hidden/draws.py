@@ -1,4 +1,4 @@
-"""Random draws of a case: the machine, how it was set up and measured, and which effects are hidden in it."""
+"""Random draws of a case: the machine, its set-ups and measurements, and the effects that are hidden in it."""
 
 from dataclasses import dataclass, replace
 

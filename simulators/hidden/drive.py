@@ -12,7 +12,7 @@ from abbe.simulators.hidden.track import Track, carriage_mm
 
 @effect("backlash")
 def backlash(e: Hidden, track: Track, out: Bend) -> None:
-    """Lost motion of width ``strength`` um; if ``e.wild``, part of it is elastic wind-up that gives way over tenths of a millimetre."""
+    """Lost motion of width ``strength`` um; if ``e.wild``, a part is elastic wind-up that gives way over tenths of a millimetre."""
     width, soft = e["strength"] * UM, e.freedom(0.1, 0.35, 1)
     out.drive[:, e.axis] = carriage_mm(track, e.axis, lambda x: np.full(x.shape, 0.5 * width * (1.0 - soft)))
     out.drive[:, e.axis] += wind_up(track, e.axis, soft * width, e.freedom(0.1, 0.8, 2) or 1.0)
@@ -42,7 +42,7 @@ def wind_up(track: Track, axis: int, width_mm: float | F, over_mm: float) -> F:
 def reversal_spike(e: Hidden, track: Track, out: Bend) -> None:
     """Friction holds the axis back after a reversal. The lag is ``strength`` um at 1000 mm/min and grows as feed^p.
 
-    It rises within a small part of d0_mm and decays over d0_mm; if ``e.wild``, its size depends on the direction and its decay has a tail.
+    The lag rises within a small part of d0_mm and decays over d0_mm; if ``e.wild``, it depends on the direction, and its decay has a tail.
     """
     if not track.moving:
         return
@@ -72,7 +72,7 @@ NODES, WEIGHTS = np.polynomial.laguerre.laggauss(10)
 def lagging(track: Track, lag_s: float, second: float) -> F:
     """Return actual minus commanded axis positions, (n, 3) mm, when the axes follow the command through a second-order loop.
 
-    Its time constants are a = lag_s (1 - second) and b = lag_s second. The commanded course is convolved with the impulse response
+    The loop's time constants are a = lag_s (1 - second) and b = lag_s second. The commanded course is convolved with the impulse response
     (exp(-s/a) - exp(-s/b)) / (a - b) by Gauss-Laguerre quadrature.
     """
     if track.course is None or lag_s == 0.0:

@@ -84,7 +84,7 @@ class Hidden:
     def freedom(self, low: float, high: float, which: int, *, signed: bool = False) -> float:
         """Return a departure from the textbook form: a random number between ``low`` and ``high``, times `bent`; 0 if `wild` is 0.
 
-        ``which``: number of the departure, unique within the effect. ``signed``: it is negative in half of the cases.
+        ``which``: number of the departure, unique within the effect. ``signed``: the departure is negative in half of the cases.
         """
         if not self.wild:
             return 0.0

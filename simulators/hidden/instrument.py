@@ -27,7 +27,7 @@ def mirror_tilt(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("laser_cosine")
 def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
-    """The beam is misaligned by ``strength`` mrad, in another direction in every set-up; if ``e.wild``, the angle differs, too."""
+    """The beam is misaligned by ``strength`` mrad, in a different direction in every set-up; if ``e.wild``, the angle differs, too."""
     if track.kind == "laser":
         aside = per_setup(e, track.setup)
         size = 1.0 + e.freedom(0.02, 0.12, 1) * float(np.sin(7.0 * aside[0]))
@@ -38,7 +38,7 @@ def laser_cosine(e: Hidden, track: Track, out: Bend) -> None:
 def setup_centre_offset(e: Hidden, track: Track, out: Bend) -> None:
     """The cup is offset from the spindle's position by ``strength`` um, in another direction in every set-up.
 
-    Simulated by a shift of the tool.
+    The simulation shifts the tool instead.
     """
     if track.kind == "bar" and track.number >= 0:
         away = e.rng(21, zlib_of(track.setup)).normal(size=3)
@@ -58,14 +58,14 @@ def zlib_of(text: str) -> int:
 
 
 def air_rise(e: Hidden, t_s: F) -> F:
-    """Return how much warmer the air is than the laser assumes, K, (n,): a wave of amplitude ``strength``; if ``e.wild``, two waves."""
+    """Return actual minus assumed temperature of the air, K, (n,): a wave of amplitude ``strength``; if ``e.wild``, two waves."""
     wave = np.sin(2.0 * np.pi * t_s / e["period_s"] + e["phase"])
     return np.asarray(e["strength"] * (wave + e.freedom(0.05, 0.25, 1) * np.sin(2.0 * np.pi * t_s / (0.31 * e["period_s"]) + e["phase"])))
 
 
 @effect("air_refraction")
 def air_refraction(e: Hidden, track: Track, out: Bend) -> None:
-    """The laser reads a path too short while the air is warmer than it assumes, and too long while it is colder."""
+    """The laser reads a path too short while the air is warmer than the laser assumes, and too long while the air is colder."""
     if track.kind == "laser":
         out.reading += AIR_PPM_PER_K * PPM * air_rise(e, track.t_s) * track.reach_mm
 

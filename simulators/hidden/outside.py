@@ -30,7 +30,7 @@ def local_bump(e: Hidden, track: Track, out: Bend) -> None:
 
 @effect("ball_form")
 def ball_form(e: Hidden, track: Track, out: Bend) -> None:
-    """The ball is not round: ``lobes`` waves of ``strength`` um over the bar's direction in the XY plane, weaker as the bar rises."""
+    """The ball is not round: ``lobes`` waves of ``strength`` um over the bar's direction in the XY plane, weaker for a steeper bar."""
     if track.kind == "bar":
         around = np.arctan2(track.look[:, 1], track.look[:, 0])
         level = track.look[:, 0] ** 2 + track.look[:, 1] ** 2

@@ -1,4 +1,4 @@
-"""Measuring plans: which runs, in which order, at which feed and where, with the clock of a whole day at the machine."""
+"""Measuring plans: runs with their order, feeds and places, and with the clock of a whole day at the machine."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace

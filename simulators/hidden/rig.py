@@ -74,10 +74,10 @@ class Rig:
         return np.asarray(np.linalg.norm(tool - cup, axis=1) - run.track.radius_mm + bend.reading)
 
     def laser(self, run: Run) -> F:
-        """Return the growth of the path to the point where the beam meets the mirror plane, minus the nominal growth, (n,) mm.
+        """Return the change of the path to the point where the beam meets the mirror plane, minus the nominal change, (n,) mm.
 
-        The mirror is square to the beam where the tool is not rotated, and rotates with the tool. A mirror aligned at the start of the run
-        instead differs by the tool's rotation there; this difference is a mirror tilt.
+        The mirror rotates with the tool, and is square to the beam if the tool is not rotated. A mirror that is aligned at the start of the
+        run differs from this by the tool's rotation there; the difference is a mirror tilt.
         """
         track = run.track
         bend = self.bend(track)

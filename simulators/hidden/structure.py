@@ -37,7 +37,7 @@ def nonrigid_bed(e: Hidden, track: Track, out: Bend) -> None:
 def ram_sag(e: Hidden, track: Track, out: Bend) -> None:
     """The ram (axis Z) sinks as it extends: -A z^2 (1 + beta y), z = 0 to 1, y = -1 to 1 (height), A = ``strength`` um.
 
-    It sinks along gravity and tilts by the slope of this curve. If ``e.wild``, the curve has a cubic part. No effect if Z is vertical.
+    The ram sinks along gravity and tilts by the slope of this curve. If ``e.wild``, the curve has a cubic part. No effect if Z is vertical.
     """
     if track.vertical == 2:
         return

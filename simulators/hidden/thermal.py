@@ -1,4 +1,4 @@
-"""Thermal effects: bodies that warm up from power-on (time 0 of the campaign clock), and what they move.
+"""Thermal effects: bodies that warm up from power-on (time 0 of the campaign clock), and the displacements by them.
 
 If ``e.wild`` (`Hidden.wild`) is not 0, an effect departs from its textbook form.
 """
@@ -15,7 +15,7 @@ STEEL_PPM = 11.5
 def warmth(t_s: F, tau_s: float, *, slow_share: float = 0.0, slow_s: float = 1.0) -> F:
     """Return the temperature rise of a body under constant heat since power-on, as a fraction of its final rise, (n,).
 
-    It is a weighted sum of two exponential rises, with time constants ``tau_s`` and ``slow_s``; ``slow_share``: weight of the second.
+    The rise is a weighted sum of two exponential rises, with time constants ``tau_s`` and ``slow_s``; ``slow_share``: weight of the second.
     """
     order = np.argsort(t_s, kind="stable")
     out = np.empty(len(t_s))
@@ -37,7 +37,7 @@ def rise(e: Hidden, t_s: F) -> F:
 
 @effect("axis_thermal_growth")
 def axis_thermal_growth(e: Hidden, track: Track, out: Bend) -> None:
-    """The screw warms up, finally by ``strength`` K, and grows from x_fixed; if ``e.wild``, unevenly: it is warmer where the nut works."""
+    """The screw warms up, finally by ``strength`` K, and grows from x_fixed; if ``e.wild``, unevenly: warmer where the nut works."""
     a = e.axis
     x = track.q_mm[:, a]
     span = track.high_mm[a] - track.low_mm[a]

@@ -27,7 +27,7 @@ class Track:
     axis' last motion, 0 if unknown; ``since_mm`` (n, 3): travel since the last reversal (`NEVER_MM` before the first); ``travelled_mm``
     (n, 3): travel in the run. ``look`` (n, 3): unit vector of the measuring direction; ``reach_mm`` (n,): nominal laser path since the
     first record, zeros for a bar. ``start_s``: when the run began. ``low_mm``, ``high_mm`` (3,): strokes. ``vertical``: index of that axis.
-    ``number``: of the run, -1 while a cup is set. ``radius_mm``: of the bar. ``course``: commanded position by time, for a moving run.
+    ``number``: the run's index, -1 while a cup is set. ``radius_mm``: of the bar. ``course``: commanded position by time, for a moving run.
     """
 
     kind: str
@@ -108,8 +108,8 @@ def _axis(step_mm: F, rest: float) -> tuple[F, F, F]:
 def follow(drive_mm: F, half_mm: F) -> F:
     """Return the carriage positions (m,) mm of one axis with play, from drive positions (m,) and half widths (m,) of the play, mm.
 
-    The first motion pushes the carriage from the start. Between two reversals of the drive the carriage rests or is pushed along: upwards
-    it is at the larger of its last position and drive - half, downwards at the smaller of its last position and drive + half.
+    The first motion pushes the carriage from the start. Between two reversals of the drive the carriage rests or is pushed along: in a
+    motion upwards it is at the larger of its last position and drive - half, downwards at the smaller of last position and drive + half.
     """
     step = np.diff(drive_mm)
     moved = np.flatnonzero(np.abs(step) > 1e-9)

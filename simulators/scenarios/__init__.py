@@ -1,1 +1,1 @@
-"""Packaged scenarios (TOML): the machine, how large its errors may be, and how its devices are reached."""
+"""Packaged scenarios (TOML): the machine, the size of its errors, and the connections of its devices."""

@@ -48,7 +48,7 @@ class Machine:
     def tool_position(self, axes_mm: F) -> F:
         """Return the position of the functional point relative to the workpiece, mm: axis positions (n, 3) give (n, 3).
 
-        Without errors this is axis positions + tool_mm.
+        Without errors the result is axis positions + tool_mm.
         """
         geometry = self.geometry
         point = np.broadcast_to(geometry.tool_mm, axes_mm.shape)
@@ -99,7 +99,7 @@ def _cross(a: F, b: F) -> F:
 class Play:
     """Three independent play operators with memory.
 
-    An axis with lost motion B that moves in direction s is at drive position - s B/2; after a reversal it rests until the drive has
+    An axis with lost motion B that moves in direction s is at drive position - s B/2; after a reversal the axis rests until the drive has
     travelled B.
     """
 
