@@ -23,7 +23,7 @@ BLOCKS, SHORTEST = 12, 8
 """Blocks per run, and readings in the shortest block. The blocks resolve up to six periods, and eight or more degrees of freedom remain
 after cup and length are fitted. Over a block the usual correlation falls to a tenth, so block sums are nearly independent."""
 FREE_MM = 1.0
-"""Prior standard deviation of a run's own unknowns, mm: so wide that it leaves them free."""
+"""Prior standard deviation of a run's own unknowns, mm, so wide that these unknowns are free."""
 NO_NOISE = "the noise of the instrument cannot be estimated from the fitted runs"
 TOO_FEW = "too few of their readings count"
 
@@ -64,7 +64,7 @@ def agreements(
     tuple of Agreement
         Their ``p`` is family-wise over the runs (Sidak).
     tuple of Unjudged
-        Runs of an instrument whose noise is unknown (not fitted, or without degrees of freedom), and runs with too few valid readings.
+        Runs of an instrument of unknown noise (not fitted, or without degrees of freedom), and runs with too few valid readings.
     """
     noise = {kind: _noise(problem, kind) for kind in problem.colours}
     root = _root(solved.theta_covariance)
@@ -112,8 +112,8 @@ def _white(
 ) -> tuple[F2, int]:
     """Return columns over the valid readings of a run, and how many of the last ones are the run's own unknowns.
 
-    The first column is the whitened residual. Each other column is the effect of one unknown of the prediction, one standard deviation
-    large. All are whitened with the assumed noise; `_tested` applies the ratio of estimated to assumed noise.
+    The first column is the whitened residual. Each other column is the effect of one standard deviation of one unknown of the prediction.
+    All are whitened with the assumed noise; `_tested` applies the ratio of estimated to assumed noise.
     """
     p, data = run.path, run.data()
     gap = np.where(run.valid, data.deviation_mm - predicted_mm, 0.0)
@@ -148,8 +148,8 @@ def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float)
     """Ratio of rms to expected rms, and p; None where too few degrees of freedom remain.
 
     The last ``free`` columns of ``white`` are the run's own unknowns. They cost only as many degrees of freedom as the values determine
-    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value over that of
-    a reading. ``spread``: as in `_Noise`.
+    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value divided by
+    that of a reading. ``spread``: as in `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known

@@ -26,7 +26,7 @@ class Significance:
 @dataclass(frozen=True)
 class Localization:
     """Location of a gap or an effect; None or empty: not located in this respect. The fields are those of ``where`` in
-    docs/schemas/discovery.schema.json. ``shape``: form of the deviation, as text. ``table``: all tests."""
+    docs/schemas/discovery.schema.json. ``shape``: shape of the deviation, as text. ``table``: all tests."""
 
     tests: tuple[str, ...] = ()
     axes: tuple[str, ...] = ()
@@ -58,8 +58,8 @@ class NamedEffect:
     alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.
     location : where its signal is largest.
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
-    needed : rms of the holdout runs without this effect over the rms with it; 1 or less: not needed. None: no holdout run, or a variance
-        effect, which changes no mean reading.
+    needed : rms of the holdout runs without this effect, divided by that with it; 1 or less: not needed. None: there is no holdout run, or
+    the effect is a variance effect, which changes no mean reading.
     sensor_doubt : why the temperature column of the warming part probably belongs to another part; empty without doubt.
     """
 
@@ -118,7 +118,7 @@ class Fitted:
 
 @dataclass(frozen=True)
 class BlindSpot:
-    """A blind spot of a campaign: ``what`` its runs cannot show, the reason ``because``, and ``adds``, the measurement that would."""
+    """A blind spot of a campaign: ``what`` its runs cannot show, why (``because``), and the measurement that could show it (``adds``)."""
 
     what: str
     because: str
@@ -159,12 +159,12 @@ class Discovery:
         catalogue does not explain.
     effects : the named effects, strongest evidence first.
     rejected : labels found but not named, each with the reason: structures without a name, effects of less evidence, residues of effects.
-    beside : structures without a name that explain a part of the gap beside the named effects, (label, evidence), strongest first.
+    beside : structures without a name that explain a further part of the gap besides the named effects, (label, evidence), strongest first.
     confounded_with : rivals of the named effects that the data do not exclude.
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
-    alone : the result without any effect; given if chance may also give names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
-    left_out : gap of the fitted runs on blocks that are left out in turn (`abbe.models.discovery.left_out`); None if holdout runs judge.
+    alone : the result without any effect; given if chance may also yield names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
+    left_out : gap of the fitted runs on blocks left out in turn (`abbe.models.discovery.left_out`); None if there are holdout runs.
     residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
     predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
     noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.
@@ -174,7 +174,7 @@ class Discovery:
     unjudged : holdout runs that cannot be judged.
     unseen : blind spots of the runs, if nothing was found.
     fitted : significant errors that the present simulation already includes (the scale of a single axis).
-    doubt : what is probably wrong with the data of the runs of ``location``, as text; then nothing was searched.
+    doubt : probable fault of the data of the runs in ``location``, as text; with such a fault nothing was searched.
     """
 
     verdict: Verdict

@@ -34,7 +34,7 @@ class Baseline:
     setup : set-up unknowns in the form of `abbe.models.solvers.observe`.
     parts : array: values of ``setup`` = parts @ the set-up unknowns of ``names``.
     names, prior_sd : names and prior standard deviations of all unknowns, smooth terms first, then set-ups; mm, rad. One ball-bar serves
-        all radii, so all share one length error ``bar_length``.
+    all radii, so all radii share one length error ``bar_length``.
     root : array, shape (p, p)
         Factor of the prior covariance root root^T, which includes the smoothness of the error motions.
     """
@@ -67,10 +67,10 @@ class Baseline:
         return value, np.concatenate([jacobian[:, :n], jacobian[:, n + LOST :] @ self.parts], axis=1)
 
     def along(self, path: Path, run: RunData, theta: F1) -> Path:
-        """Return the path with the actual direction of the bar in ``look``: the cup's offset and the machine's deviation turn the bar.
+        """Return the path with the bar's actual direction in ``look``: the cup's offset and the machine's deviation turn the bar.
 
-        This matters if the axes lag: with a bar of 150 mm and an offset of 30 um, a lag of 1 mm along the path changes the reading by 0.2
-        um.
+        The turn matters if the axes lag: with a bar of 150 mm and an offset of 30 um, a lag of 1 mm along the path changes the reading by
+        0.2 um.
         """
         if path.kind != "bar":
             return path

@@ -20,7 +20,7 @@ GENEROUS = 3.0
 VISIBLE_SHARE = 1e-5
 """A candidate is invisible when the projection leaves less than this fraction of its squared norm."""
 MOST_CACHED = 16
-"""Number of picks whose columns are cached, because a search returns to those just used."""
+"""Number of picks whose columns are cached; a search often returns to recent picks."""
 Short = NDArray[np.float32]
 PART = 20
 """Candidates whitened together; whitening makes several copies of its input."""
@@ -108,7 +108,7 @@ class Bank:
         bank only chooses where a refinement starts; the parts take half of the memory of a search.
     own : array, shape (K,): squared norm of each column before projection; K: number of all columns.
     gram : tuple of arrays (k, k), one per group: columns^T M columns (M: `SignalProjection`). rhs : array, shape (K,): columns^T M y.
-    prior_sd : array, shape (K,). logs : array, shape (groups,): log of the number of readings that a column changes, summed over the group.
+    prior_sd : array, shape (K,). logs : array, shape (groups,): sum over the columns of log(number of readings that a column changes).
     """
 
     picks: tuple[Pick, ...]
@@ -159,7 +159,7 @@ class _Group:
 
 
 def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
-    """Gains of groups with equally many columns, rhs^T (gram + prior^-2)^-1 rhs; columns hardly visible after projection add little."""
+    """Gains of groups with equal numbers of columns, rhs^T (gram + prior^-2)^-1 rhs; columns hardly visible after projection add little."""
     k = gram.shape[1]
     eye = np.eye(k)
     weight = prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30
@@ -168,7 +168,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
-    """Build the bank of all picks that change a reading; take over columns from the problem's other banks in memory."""
+    """Build the bank of all picks that change a reading; reuse columns of the problem's other banks in memory."""
     asked = [p.start for p in picks]
     banks = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in banks if list(b.known) == asked), None)

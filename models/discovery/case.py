@@ -27,7 +27,7 @@ class CaseRun:
     length_calibrated: bool | None = None
 
     def data(self) -> RunData:
-        """Return the run as solver input; all its readings are kept, but flagged readings and those of a sealed run are set to zero."""
+        """Return the run as solver input with all its readings; flagged readings, and those of a sealed run, are set to zero."""
         p = self.path
         reading = np.zeros(p.n) if self.deviation_mm is None else np.where(self.valid, self.deviation_mm, 0.0)
         bar = p.kind == "bar"

@@ -32,7 +32,7 @@ LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
 SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
 """Sizes of a change of a motion's shape that are tried, as multiples of its documented size (`abbe.models.solvers.priors`)."""
 ENOUGH = 3.0
-"""A change is named from this log evidence on, after its price: the readings are twenty times as likely with it."""
+"""A change is named from this log evidence (after its price) on: with the change, the readings are twenty times as likely."""
 NEAR = 3.0
 """The runs cannot distinguish a named change from a rival whose evidence is lower by no more than this."""
 MOST = 6
@@ -96,7 +96,7 @@ def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
 
 
 def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
-    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus that with all unknowns zero."""
+    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus that for zero unknowns."""
     if not base.shape[1]:
         return 0.0
     inside = base.T @ gram @ base
@@ -156,7 +156,7 @@ class ChangeContext:
 
     @cached_property
     def _open(self) -> F2:
-        """Factor of the covariance if nothing changed, shape (p, p): that of the old solution, of lost motion and of set-ups."""
+        """Factor of the covariance of all unknowns if nothing changed, shape (p, p): old solution, lost motion and set-ups."""
         typical, p, n = self.problem.sizes.typical, len(self.problem.names), self._n
         out = np.zeros((p, p))
         out[:n, :n] = self.known.root() / typical[:n, None]
@@ -188,7 +188,7 @@ class ChangeContext:
         Greedy selection alone has two weaknesses. A flexible shape may first gain more than either of two linear changes that together
         explain everything. And if all axes grow equally, no axis alone gains anything, because a laser's wavelength explains the growth
         nearly as well. So selection starts three times: from no change, from linear changes chosen first, and from all linear changes. The
-        choice with the largest evidence wins; no change at all is one of the choices.
+        choice with the largest evidence wins, which may be no change at all.
         """
         weight = np.exp(-self.fit.components.eta)
         gram, rhs = np.tensordot(weight, sums.gram, 1), weight @ sums.rhs
@@ -258,7 +258,7 @@ class ChangeContext:
         return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:
-        """Factor of the covariance of all unknowns if all scales and squareness errors may change, too, but not candidate ``but``.
+        """Factor of the covariance of all unknowns if all scales and squareness errors may also change, except candidate ``but``.
 
         Shape (p, k), as in `_beside`.
         """
@@ -389,7 +389,7 @@ class Change:
     rivals : tuple of (name, missing evidence)
         Candidates that explain nearly as much in its place: these runs cannot distinguish them.
     halves : int
-        In how many halves of the runs it was chosen independently: 0 to 2.
+        Number of halves of the runs, 0 to 2, in which this change was chosen independently.
     """
 
     name: str
@@ -405,7 +405,7 @@ class Changed:
     """All changes found.
 
     The set-ups are split in two halves, and each half is judged with the changes that the other half chose. ``before_mm``: rms of readings
-    minus the old solution; ``after_mm``: the same with the changes; ``judged``: gain in log likelihood, the smaller of both halves. With
+    minus the old solution; ``after_mm``: rms with the changes; ``judged``: gain in log likelihood, the smaller of both halves. With
     too few set-ups these three are None.
     ``floor_mm``: rms noise. ``hidden``: bound on each change of scale (m/m) or squareness (rad) that was not named but would show.
     """
@@ -426,12 +426,12 @@ def changed_since(known: KnownField, runs: tuple[RunData, ...]) -> Changed:
     known : KnownField
         The old solution, with its covariance.
     runs : tuple of RunData
-        Runs measured since, corrected for the active table and known effects as the runs of the solution were.
+        Runs measured since then, corrected for the active table and known effects in the same way as the runs of the solution.
 
     Raises
     ------
     ValueError
-        No runs, or one that cannot be used; the message names it.
+        No runs, or an unusable run, which the message names.
     """
     if not runs:
         raise ValueError("changes: no runs")

@@ -26,13 +26,13 @@ from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, lin
 from abbe.models.effects.effect import Effect
 
 MOST_GATED = 0.35
-"""Readings that a stick-slip makes scatter are excluded from the search for mean effects, unless they reach this share of all readings."""
+"""Readings with scatter from stick-slip are excluded from the search for mean effects, unless they reach this share of all readings."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
-"""A rival replaces a named effect if it lowers chi-square by this much more; a new name needs the same margin."""
+"""A rival replaces a named effect if its chi-square is lower by at least this; a new name needs the same margin."""
 ROUNDS = 3
-"""Maximum number of repetitions of the search, each with noise and simulation refitted beside the findings."""
+"""Maximum number of repetitions of the search, each with noise and simulation refitted together with the findings."""
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
@@ -52,7 +52,7 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """Remove variance effects from a problem: project vibrations out of each ball-bar run, and give the scattering readings weight 0."""
+    """Remove variance effects from a problem: project vibrations out of each ball-bar run, give readings with excess scatter weight 0."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":
@@ -148,8 +148,8 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
 def fairly(contest: Contest, found: list[Selection]) -> tuple[list[Selection], list[list[Rival]]]:
     """Replace each named effect by a rival if the rival explains the readings better; return the findings with their rivals.
 
-    The search compares effects in their textbook form, so it may have chosen the wrong one of two similar effects. Here both may deviate
-    from it (`Form`).
+    The search compares effects in their textbook form, so it may have chosen the wrong one of two similar effects. Here effect and rival
+    may deviate from the textbook form (`Form`).
     """
     changed = False
     for i in range(len(found)):

@@ -30,8 +30,8 @@ from abbe.models.effects.effect import Effect, Family
 from abbe.models.probability import chi2_above
 
 TRUE_TO_FORM: dict[Family, float] = {"drive": 0.03, "structure": 0.03, "thermal": 0.12, "instrument": 0.05, "geometry": 0.1}
-"""Relative standard uncertainty of a strength because no machine follows a formula exactly, by family. It is largest for thermal effects: a
-warming part has several time constants, and a campaign does not see the longest."""
+"""Relative standard uncertainty of a strength, by family, because no machine follows a formula exactly. It is largest for thermal effects:
+a warming part has several time constants, and a campaign does not see the longest."""
 TRUE_TO_FORM_OF = {
     "contour_lag": 0.05,  # a second lag in the loop counts in the sum, but shrinks a circle less
     "cyclic_error": 0.1,  # swells along its screw, by a tenth to a third
@@ -51,15 +51,15 @@ OFFSET = "offset"
 TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a thermal time constant: of several time constants, a short campaign shows only the short ones."""
 RESIDUE_SHARE = 0.001
-"""A name with less evidence than this share of the largest cannot be distinguished from a residue of the largest."""
+"""A name with less than this share of the largest evidence cannot be distinguished from a residue of the strongest effect."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
 """Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
 this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
 less like scatter. A true stick-slip had 1.0 % of a pitch error."""
 AXIS_SHARE = 0.02
 AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""Effects at the reversals of one axis differ only in form: one with less than `AXIS_SHARE` of another's evidence is a residue of that
-one."""
+"""Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect
+is a residue of the other."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.03
@@ -73,10 +73,10 @@ REST_SHARE = 0.1
 """If part of the gap has no explanation, a name with less than this share of that part's evidence is a residue of it: an unknown effect
 always resembles some name a little. In cases whose effects were all found, no such part remains."""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name is a residue of another if its evidence is below the first share of the other's and their signals overlap by more than the
-second."""
+"""A name is a residue of another if its evidence is below `COMPANION_SHARE` of the other's and their signals overlap by more than
+`COMPANION_OVERLAP`."""
 STARTS = 2000.0
-"""Assumed number of starts compared in a campaign, to bound the p-value of the best."""
+"""Assumed number of starts that are compared in a campaign; it bounds the p-value of the best start."""
 
 
 def true_to_form(name: str, family: Family) -> float:
@@ -85,7 +85,7 @@ def true_to_form(name: str, family: Family) -> float:
 
 
 def shape_of(pick: Pick, u: Mapping[str, float]) -> dict[str, tuple[float, float]]:
-    """Return value and standard uncertainty of each non-linear parameter; that of a thermal time constant includes `TIME_TRUE_TO_FORM`."""
+    """Return value and standard uncertainty of each non-linear parameter; `TIME_TRUE_TO_FORM` is included for thermal time constants."""
     times = {"tau_s"} if pick.effect.family == "thermal" else set()
     values = {name: float(pick.values[name]) for name in u}
     return {name: (v, float(np.hypot(u[name], TIME_TRUE_TO_FORM * v)) if name in times else u[name]) for name, v in values.items()}
@@ -123,9 +123,9 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
     """Return the matrix from the coefficients of a pick, forms included, to coefficients of the plain effect with the nearest signal.
 
-    Nearest: by least squares. Shape (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's size
-    count: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic or
-    wind-up, are no part of the strength. ``offset``: fit the start value of a sensor as well, so that it does not change the strength.
+    "Nearest" is by least squares. Shape: (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's
+    size count: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic
+    or wind-up, are no part of the strength. ``offset``: fit the start value of a sensor, too, so that it does not change the strength.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]
@@ -154,7 +154,7 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
     - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
       mismatch);
     - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
-      positioning beside thermal growth of the same axis), another lag of the drives.
+      positioning and thermal growth of the same axis), another lag of the drives.
 
     Parameters
     ----------
@@ -202,7 +202,7 @@ def _together(a: str, b: str) -> bool:
 
 @dataclass(frozen=True)
 class _Judgement:
-    """Sorted findings: named effects, structures without a name, rejected labels with reasons; ``mean``: indices of named mean effects."""
+    """Findings sorted into named effects, unnamed structures, rejected labels with reasons; ``mean``: indices of named mean effects."""
 
     mean: tuple[int, ...]
     effects: tuple[NamedEffect, ...]
@@ -225,7 +225,7 @@ def finding(
     Parameters
     ----------
     problem, plain : the problem after the search, with noise estimated together with the findings; the problem before the search.
-    found, loud : mean and variance effects found. solved, rivals : solution with ``found``, and the rivals of each of these.
+    found, loud : mean effects and variance effects found. solved, rivals : solution with ``found``, and the rivals of each mean effect.
     predicted : predicted readings of every run by label, mm, without and with the effects.
     """
     case, floor = problem.case, floors(problem)
@@ -271,7 +271,7 @@ def finding(
 
 
 def doubted(found: Discovery, mixed: MixedUp) -> Discovery:
-    """Replace a result by the suspicion that some readings have the wrong label. No effect is named before this is settled."""
+    """Replace a result by the suspicion that some readings have the wrong label. No effect is named before this suspicion is settled."""
     whose = " and ".join(mixed.runs)
     doubt = f"the readings of {whose} are probably {mixed.how}: after the correction, {mixed.remains:.0%} of the misfit of all runs remains"
     location = Localization(runs=mixed.runs, table=found.location.table)
@@ -290,7 +290,7 @@ def _judge(
 ) -> _Judgement:
     """Sort the findings into named effects, structures without a name, and residues of other effects or of unexplained residuals.
 
-    ``rest``: evidence, in nats, of what all findings together leave above the noise.
+    ``rest``: evidence, in nats, of the residuals above the noise that all findings together leave.
     """
     companions = _companions(problem, found, solved)
     uneven, waves = _uneven(problem, found)
@@ -321,7 +321,7 @@ def _judge(
 
 
 def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[frozenset[str], tuple[Structure, ...]]:
-    """Find waves that take two close pitches to fit: their period is not constant. Return the labels, and the waves without a name."""
+    """Find waves that only two close pitches fit: their period is not constant. Return their labels, and the waves without a name."""
     labels, waves = set[str](), []
     for i, j in permutations(range(len(found)), 2):
         second, first = found[i].pick, found[j].pick
@@ -351,7 +351,7 @@ def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[froze
 
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
-    """Return, by index of the effect, the rms of the holdout runs without it over that with all effects (`NamedEffect.needed`)."""
+    """Return for each effect, by index, the rms of the holdout runs without it divided by that with all effects (`NamedEffect.needed`)."""
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
@@ -369,7 +369,7 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int])
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Return the labels of rivals whose chi-square is short by less than `EXCLUDED`; `NamedEffect.alternatives` also has weaker ones."""
+    """Return the labels of rivals that lack less than `EXCLUDED` of chi-square; `NamedEffect.alternatives` also contains weaker rivals."""
     return tuple(dict.fromkeys(label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0))
 
 
@@ -393,7 +393,7 @@ def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: 
 
 
 def _companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Map the index of each finding that is only a residue of another to the index of that other."""
+    """Map the index of each finding that is only a residue to the index of the finding of which it is a residue."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
         size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
@@ -427,7 +427,7 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
 
 
 def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
-    """Propose the measurement that best separates the strongest named effect with rivals from these; without rivals, a run that judges."""
+    """Propose the measurement that best separates the strongest named effect with rivals from them; without rivals, a holdout run."""
     for i in kept:
         if not rivals[i]:
             continue
@@ -442,8 +442,8 @@ def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedMode
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
-    """Count the scatter of variance effects in the fitted runs as noise of all roles: it cannot be predicted, so naming it closes no
-    gap."""
+    """Count the scatter of variance effects in the fitted runs as noise of all roles: it cannot be predicted, so a name for it closes
+    no gap."""
     fitted = gaps["identify"]
     scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)
     return {role: replace(g, floor_mm=float(np.sqrt(g.floor_mm**2 + scatter))) for role, g in gaps.items()}

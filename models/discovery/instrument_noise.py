@@ -25,11 +25,11 @@ noise."""
 CLEARLY = 0.85
 """The noise from differences of neighbours is used if it is below this fraction of the residuals' standard deviation."""
 FINE, QUIET, SHORTEST = 4, 0.25, 24
-"""`FINE`: order of the differences of neighbours; these show the noise even of an incomplete model, for example a missing wave of eight
-readings adds 0.5 %. `QUIET`: share of an instrument's runs that effects leave quiet. `SHORTEST`: readings that a run must have."""
+"""`FINE`: order of the differences of neighbours, which show the noise even if the model is incomplete (a missing wave of eight readings
+adds 0.5 %). `QUIET`: share of an instrument's runs that no effect disturbs. `SHORTEST`: readings that a run must have."""
 CROWD, TURN_MM, CREEP_MM_S = 0.35, 3.0, 4.5
-"""`CROWD`: if a larger share of eleven neighbours is off, they are a disturbance, not single wrong readings. `TURN_MM`: travel after a
-reversal in which a spike ends. `CREEP_MM_S`: speed below which an axis may stick and slip."""
+"""`CROWD`: if a larger share of eleven neighbours is off, these readings are a disturbance, not single wrong readings. `TURN_MM`: travel
+after a reversal within which a spike ends. `CREEP_MM_S`: speed below which an axis may stick and slip."""
 LOW = 1.2
 """Relative bias of the noise found by `fine`, in units of 1/sqrt(n) for n readings: even without effects, the run at the share `QUIET` has
 less noise than the average run. Product of 0.67 (quartile), 1.17 (median) and 1.5 (differences share readings)."""
@@ -41,7 +41,7 @@ LONE = 7.0
 class Colour:
     """Noise of one instrument. ``share``: correlated part of its variance; ``memory``: correlation of this part from reading to reading.
 
-    ``gain``: by how much (log likelihood) these two explain its readings better than the usual ones; 0 for the usual ones.
+    ``gain``: gain in log likelihood of the readings with these two values over the usual ones; 0 for the usual ones.
     """
 
     sd_mm: float
@@ -52,7 +52,7 @@ class Colour:
     def filter(self) -> tuple[float, float, float]:
         """Return (m, c, v) of the ARMA(1, 1) process with the autocovariance of this noise: (1 - m B) noise = (1 + c B) innovation.
 
-        B shifts by one reading. v is the variance of an innovation if that of a reading is 1; the autocovariance is then 1, s m, s m^2, ...
+        B shifts by one reading. v is the variance of the innovation for readings of variance 1; their autocovariance is 1, s m, s m^2, ...
         with share s and memory m.
         """
         s, m = self.share, self.memory
@@ -80,7 +80,7 @@ def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours:
 
 
 def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> dict[str, Colour]:
-    """Estimate the autocorrelation of each instrument's noise from residuals as for `level`; without clear evidence keep the usual colour.
+    """Estimate the autocorrelation of each instrument's noise from residuals (as in `level`); without clear evidence keep the usual colour.
 
     Clear evidence: the log likelihood gains `REMEMBERS` over all runs and improves in `MOST` of them, because a single event is not noise.
     """
@@ -103,7 +103,7 @@ def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colou
 
 
 def comes_back(paths: Sequence[Path], residual: Sequence[F1], kind: str) -> bool:
-    """Whether residuals of an instrument are alike in runs along the same path: then they are not noise.
+    """Whether residuals of an instrument are alike in runs along the same path; such residuals are not noise.
 
     The limit is a mean correlation of `AGAIN`. Without two runs along one path the answer is True. ``residual``: one array (n,) per run.
     """
@@ -169,7 +169,7 @@ def level(
 
 
 def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1) -> dict[str, Colour]:
-    """Estimate the noise of each instrument from differences of neighbours alone, which hold hardly any effect; arguments as in `level`.
+    """Estimate the noise of each instrument only from differences of neighbours, which contain hardly any effect; arguments as in `level`.
 
     The noise is that of the instrument's quiet runs (`QUIET`): an effect may be sharp or dense in some runs, but not in all.
     Instruments without runs of `SHORTEST` readings are left out.
@@ -190,7 +190,7 @@ def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, le
 def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str], turns: F1, resolution_mm: Mapping[str, float]) -> F1:
     """Weights, shape (n,): 0 for single readings far from their neighbours (`LONE`; a beam cut or a cup bumped for a moment), else 1.
 
-    Ball-bar readings keep weight 1 if many near each other are off (`CROWD`), or if they lie beside a reversal (``turns`` is 1 there) and
+    Ball-bar readings keep weight 1 if many near each other are off (`CROWD`), or if they lie next to a reversal (``turns`` is 1 there) and
     readings elsewhere are off less often.
     """
     out = np.ones(residual.size)
@@ -215,9 +215,9 @@ def lone(residual: F1, lengths: Sequence[int], kinds: Sequence[str], turns: F1, 
 
 
 def beside_turns(paths: Sequence[Path]) -> F1:
-    """Return 1 for readings beside a reversal of an axis, else 0, stacked over the runs, shape (n,).
+    """Return 1 for readings next to a reversal of an axis, else 0, stacked over the runs, shape (n,).
 
-    Beside: after it within `TURN_MM`, the last reading before it, or while an axis creeps on its way there (`CREEP_MM_S`).
+    These are readings within `TURN_MM` after the reversal, the last before it, and those while an axis creeps towards it (`CREEP_MM_S`).
     """
     out = []
     for p in paths:

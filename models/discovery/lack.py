@@ -1,6 +1,6 @@
 """Lack of fit: whether residuals exceed independently known noise after the search has found nothing.
 
-The search finds only known shapes, and noise estimated from the residuals includes unknown ones. So the noise comes from repeats if there
+The search finds only known shapes, and noise estimated from the residuals includes unknown shapes. So the noise comes from repeats if there
 are any. The verdict "nothing is missing" requires that residuals agree with this noise: all together, run by run, and by position,
 direction, time, feed and temperature (`abbe.models.discovery.localization.locate`). Holdout runs must agree, too.
 """
@@ -28,16 +28,16 @@ TIMES = 1.5
 CHANCE = 1e-3
 """Significance level of statements about one run, position or direction, family-wise for a campaign."""
 FEWEST, REPEATS = 8, 20
-"""Minimum number of readings for judging a single run, and of repeats for estimating noise."""
+"""Minimum number of readings for a test of a single run; minimum number of repeats for an estimate of noise."""
 SHARED = 6
-"""Readings per degree of freedom of the noise from differences of neighbours: the differences share readings, and their median is taken."""
+"""Readings per degree of freedom of the noise from differences of neighbours: differences share readings, and a median is used."""
 NEAR_MM = 0.05
 """Positions closer than this are repeats of one position."""
 ALONG_ONE_AXIS = 0.999
 """A laser measures along one axis if this component of its beam's unit vector is larger."""
 KNOWN_FREEDOM = 1e6
 COMMON, PERIODIC = 0.8, 0.6
-"""Least share of the residuals' energy for reporting them as alike in both directions, and for reporting a period."""
+"""Least share of the residuals' energy: `COMMON` to report residuals as alike in both directions, `PERIODIC` to report a period."""
 
 
 @dataclass(frozen=True)
@@ -73,8 +73,8 @@ def floors(problem: WhitenedProblem) -> dict[str, Floor]:
 def repeat_steps(case: Case, kind: str) -> F1:
     """Return the differences, mm, of successive dwell readings at the same position of a set-up, approached from the same side.
 
-    Slow drift contributes little to them; errors of position, direction and set-up contribute nothing. Each run of a laser has its own
-    zero, so the mean of the differences between two runs is removed.
+    Slow drift contributes little to these differences; errors of position, direction and set-up contribute nothing. Each laser run has its
+    own zero, so the mean of the differences between two runs is removed.
     """
     visits: dict[object, list[tuple[float, float, str]]] = {}
     for run in case.runs:
@@ -94,7 +94,7 @@ def repeat_steps(case: Case, kind: str) -> F1:
 
 
 def _about_mean(differences: F1) -> F1:
-    """Remove the mean of the differences between two runs; the rest is enlarged for the lost degree of freedom."""
+    """Remove the mean of the differences between two runs, and enlarge the rest to allow for the lost degree of freedom."""
     n = differences.size
     return np.asarray((differences - differences.mean())[: n if n > 1 else 0] * np.sqrt(n / max(n - 1, 1)))
 
@@ -131,9 +131,9 @@ def lack_of_fit(
 
 
 def unexplained(problem: WhitenedProblem, picks: Sequence[Pick], floor: Mapping[str, Floor], calm: F1) -> float:
-    """Return the residuals of picks and simulation above the noise ``floor``, in nats of the search; 0 within `TIMES` of it.
+    """Return the residuals of picks and simulation above the noise ``floor``, in nats of the search; 0 up to `TIMES` the floor.
 
-    ``calm``: weight of each reading, shape (n,), 0 where a known effect makes the readings scatter.
+    ``calm``: weight of each reading, shape (n,), 0 for readings with scatter from a known effect.
     """
     projection = problem.projection
     for pick in picks:
@@ -203,7 +203,7 @@ def _loudest(y: F1, up: F1) -> int:
 
 
 def _period(x: F1, y: F1) -> float | None:
-    """Return the period, mm, of the wave that explains most of y beside a straight line; None if none explains enough."""
+    """Return the period, mm, of the wave that, added to a straight line, explains most of y; None if no wave explains enough."""
     if x.size < FEWEST:
         return None
     spacing, span = float(np.median(np.diff(x))), float(np.ptp(x))

@@ -14,7 +14,7 @@ from abbe.models.discovery.solved_model import SolvedModel
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 
 BLOCKS = 5
-"""Blocks of a run. Each of the fits leaves out one block of every run, at another part of the path from run to run."""
+"""Number of blocks of a run. Each fit leaves out one block of every run; this block lies on another part of the path from run to run."""
 
 
 def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[str, Floor]) -> Gap | None:

@@ -25,9 +25,9 @@ from abbe.models.probability import chi2_above, normal_above
 SHARE = 0.9
 """A signal is located at the time and position that hold this share of its energy."""
 PRESENT = 0.2
-"""A test, run, axis or direction counts as affected from this fraction of the strongest one's mean square on."""
+"""A test, run, axis or direction counts as affected if its mean square is at least this fraction of the largest."""
 LOCAL = 0.25
-"""A signal is confined in position or time when the part that holds it is at most this fraction of the campaign."""
+"""A signal is confined in position or time if the part that contains it is at most this fraction of the campaign."""
 
 K = TypeVar("K", str, int)
 BLOCKS = 12
@@ -38,7 +38,7 @@ CELLS = 4
 """Position cells along each axis."""
 LEAST = 20
 NEIGHBOURS, DIFFER = " (neighbours)", " up and down differ"
-"""Suffixes in the table for tests of a run's neighbouring residuals, and of an axis' two directions."""
+"""Suffixes in the table: for the test of a run's neighbouring residuals, and for that of an axis' two directions."""
 ROOM = 1.15
 """Factor on the noise variance, which is known to some percent only."""
 DEPENDS = {
@@ -68,7 +68,7 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     Parameters
     ----------
     signal : one array (n,) per path
-        Contribution of the effect to the readings, in one unit for all (mm, or sigmas).
+        Contribution of the effect to the readings; all in the same unit (mm or sigmas).
 
     Returns
     -------
@@ -155,7 +155,7 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Localization:
     ----------
     paths : runs.
     whitened : one array (n,) per run
-        Whitened residuals, unit variance for noise alone; exact zeros count as no reading.
+        Whitened residuals, of variance 1 for noise alone; exact zeros mark missing readings.
 
     Returns
     -------

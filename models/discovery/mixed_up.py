@@ -20,15 +20,15 @@ from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
 REMAINS = 0.6
-"""Readings are mixed up if their correction leaves less than this share of the misfit of the whole campaign ..."""
+"""Readings count as mixed up only if their correction leaves less than this share of the misfit of the whole campaign."""
 ALONE = 0.5
-"""... and no correction of other runs explains this share of what the best one explains."""
+"""Readings count as mixed up only if no correction of other runs explains this share of what the best correction explains."""
 SAME_MM = 0.5
-"""Tool vectors that differ by less are one tool; a component below this size has no sign that could be wrong."""
+"""Tool vectors that differ by less are one tool; for a component below this size no wrong sign is searched."""
 EXCESS = 0.4
-"""A tool's sign is wrong if its correction leaves less than this share of the misfit above the noise ..."""
+"""A tool's sign counts as wrong only if its correction leaves less than this share of the misfit above the noise."""
 CLEAR = 60.0
-"""... and chi-square becomes smaller by more than this."""
+"""A tool's sign counts as wrong only if its correction lowers chi-square by more than this."""
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class MixedUp:
 def mixed_up(problem: WhitenedProblem) -> MixedUp | None:
     """Find the runs of a problem whose readings are exchanged or reversed; None if no correction explains most of the misfit.
 
-    ``problem``: readings whitened about the present simulation, before any search.
+    ``problem``: whitened differences between readings and present simulation, before any search.
     """
     tried = list(_tried(problem))
     if not tried:
@@ -79,7 +79,7 @@ def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]
 
 
 def wrong_tool(problem: WhitenedProblem) -> MixedUp | None:
-    """Find the tool that explains most of the misfit if one component of its vector changes sign; None without one, or with a single tool.
+    """Find the tool that explains most of the misfit if one component of its vector changes sign; None if there is none or only one tool.
 
     If two tools explain it equally, both are named: reversed tool vectors with reversed rotations give the same readings.
     ``problem``: as for `mixed_up`. Every tool and component is tried by a new fit of the simulation.

@@ -16,15 +16,15 @@ import scipy
 from abbe.models.arrays import F1, F2
 
 P_LIMIT = 0.005
-"""A drift is claimed below this p-value ..."""
+"""A drift is claimed only below this p-value."""
 SHARE_LIMIT = 0.5
-"""... and from this share of the repeat variance on; removing less improves the repeatability by less than 30 %."""
+"""A drift is claimed only from this share of the repeat variance on; removing less improves the repeatability by less than 30 %."""
 TAUS = (0.15, 0.3, 0.6, 1.2)
 """Time constants tried, as fractions of the test's duration; a longer one is nearly a straight line."""
 TRIALS = 2000
 MEMORIES = np.linspace(0.0, 0.96, 25)
 LEAST = 3
-"""Least number of visits of a position from one side for its repeats to count."""
+"""Repeats of a position count only if it was visited from one side at least this often."""
 
 
 @dataclass(frozen=True)
@@ -35,7 +35,7 @@ class RepeatDrift:
     ----------
     named : whether the drift is reported: p below `P_LIMIT` and share of `SHARE_LIMIT` or more.
     share : part of the variance of the repeats that the drift explains, 0 to 1.
-    p : probability that noise with the residuals' memory gives as large a share.
+    p : probability that noise with the memory of the residuals gives an equal or larger share.
     form, tau_s : "linear", or "exponential" with its time constant.
     change_mm, u_change_mm : drift from the first to the last reading, with its standard uncertainty.
     before_mm, after_mm : standard deviation of the repeats before and after the drift is removed.
@@ -154,7 +154,7 @@ def _memory(residual: F1, taken: F2) -> float:
 
 
 def _chance(gain: float, basis: F2, units: F2, memory: float) -> float:
-    """Probability that some form of drift explains as large a share of noise with this memory."""
+    """Probability that some form of drift explains an equal or larger share of noise with this memory."""
     rng = np.random.default_rng(20261121)
     n = basis.shape[0]
     root = scipy.linalg.cholesky(_correlation(n, memory), lower=True)

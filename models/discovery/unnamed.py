@@ -96,7 +96,7 @@ def _place(location: Localization) -> list[str]:
 
 @dataclass(frozen=True)
 class _Plan:
-    """Experiment for a kind of structure: the first addition of ``adds`` that the campaign lacks. If it lacks none of these, the last one
+    """Experiment for a kind of structure: the first addition of ``adds`` that the campaign lacks. If the campaign has all of them, the last
     is proposed again (with ``always``), or else a repetition of the run. ``between``: the two causes that the experiment separates;
     ``why``: text with ``{run}`` and ``{standstill}``."""
 
@@ -182,7 +182,7 @@ def propose_unnamed(case: Case, structures: Sequence[Structure]) -> NextTest | N
 
 
 def _chosen(kind: str, like: Path, open_: set[str]) -> tuple[_Plan, str]:
-    """Return the plan for a kind of structure, and which of the additions that the campaign lacks (``open_``) to propose."""
+    """Return the plan for a kind of structure, and the addition to propose, out of those that the campaign lacks (``open_``)."""
     plan = _PLANS[kind]
     adds = next((a for a in plan.adds if a in open_), None)
     if kind == "bump" and like.kind != "bar":  # the plan needs a ball-bar

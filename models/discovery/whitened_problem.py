@@ -63,7 +63,7 @@ class SignalProjection:
 
     @classmethod
     def nothing(cls, n: int) -> SignalProjection:
-        """Return the projection that projects nothing out (the identity), with n readings of zero."""
+        """Return the identity, a projection that projects nothing out, with n readings of zero."""
         return cls(np.zeros(n), np.zeros((n, 0)), np.ones(n), np.zeros((0, 0)), np.zeros((0, n)), np.zeros(0))
 
     @classmethod
@@ -119,7 +119,7 @@ class SignalProjection:
 
 
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:
-    """Return the rows of `SignalProjection.rows` for ``columns``, given what the projection leaves of them (``left``)."""
+    """Return the rows of `SignalProjection.rows` for ``columns``; ``left``: the part of the columns that the projection leaves."""
     gram = columns.T @ left + np.diag(prior_sd**-2.0)
     return np.asarray(scipy.linalg.solve_triangular(scipy.linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))
 
@@ -136,7 +136,7 @@ class WhitenedProblem:
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
-    also : array, shape (n, k): columns beside the simulation that are projected out, too (waves of a vibration), mm per mm.
+    also : array, shape (n, k): further columns, projected out together with the simulation's (waves of a vibration), mm per mm.
     column_cache : whitened columns of picks and their projection. banks : banks of candidates of this problem that are still in
         memory. widths : number of columns of an effect along one run, by label. All three are caches.
     """
@@ -189,7 +189,7 @@ class WhitenedProblem:
 
 @dataclass(frozen=True)
 class Slopes:
-    """Derivatives of the readings, shape (n, p), in single precision: linearising about the perfect machine errs by 1e-4 anyway."""
+    """Derivatives of the readings, shape (n, p), in single precision: linearisation about the perfect machine has errors of 1e-4 anyway."""
 
     short: NDArray[np.float32]
 
@@ -213,7 +213,7 @@ class Slopes:
 class Tangent:
     """Derivatives of all readings with respect to the simulation's unknowns at the perfect machine.
 
-    Errors of micrometres turn bar and beam by 1e-4 at most, so the derivatives are constant and only the reading is computed exactly.
+    Errors of micrometres turn bar and beam by 1e-4 at most, so the derivatives are taken as constant; only the reading is exact.
     ``raw``: not whitened, (n, p). ``columns``: whitened for noise of 1 mm, (n, p). ``gram``: their Gram matrix (p, p), per instrument.
     """
 
@@ -296,9 +296,9 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
 
 
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]], *, memory: bool = False) -> WhitenedProblem:
-    """Estimate the noise of a problem again beside the effects ``found`` (raw columns, prior sd), and exclude single outliers.
+    """Estimate the noise of a problem again, with the effects ``found`` (raw columns, prior sd) fitted, and exclude single outliers.
 
-    ``memory``: also estimate the autocorrelation of the noise (`remembered`). Only after a search: before it, effects would count as noise.
+    ``memory``: also estimate the autocorrelation of the noise (`remembered`); only after a search, or effects would count as noise.
     """
     for k in range(ROUNDS):
         problem = with_projection(problem)

@@ -35,7 +35,7 @@ OTHER_FEED = 1.3
 REPEAT_LATE_S = 3600.0
 """A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours."""
 SAME_MM = 2.0
-"""Two paths are the same when their extents agree to this along every axis; their single readings differ with the feed."""
+"""Two paths are the same when their extents agree within this along every axis. Single readings do not tell, as they depend on the feed."""
 SAME_LOOK = 0.01
 """Beams whose unit vectors differ by less in every direction are parallel."""
 GROWS = "errors that grow with the feed (lag, servo mismatch, vibration of the drives) look like geometry"
@@ -48,7 +48,7 @@ MOVING = "errors that occur only in motion on a curve (reversals of two axes, se
 
 @dataclass(frozen=True)
 class ExperimentOffer:
-    """One possible addition to a campaign: its name (``adds``), the runs to simulate, the minutes they take, and a description (``why``).
+    """A possible addition to a campaign: its name (``adds``), the runs to simulate, the minutes for them, and a description (``why``).
 
     ``subtracted``: runs of an angular interferometer's second beam, whose readings are subtracted from those of ``runs``.
     ``knows_length``: whether the addition makes the bar's length known.
@@ -93,7 +93,7 @@ def offers(case: Case) -> tuple[ExperimentOffer, ...]:
 
 
 def judging_run(case: Case) -> NextTest | None:
-    """Return a holdout run in the other direction, needed to prove a name; None if the campaign has a holdout run or no ball-bar run."""
+    """Return a holdout run in the other direction, to prove a name; None if the campaign has a holdout run already, or no ball-bar run."""
     bars = [r.path for r in case.of("identify") if r.path.kind == "bar"]
     if case.of("holdout") or not bars:
         return None
@@ -148,7 +148,7 @@ def _bar_variants(bars: list[Path], start: float) -> list[ExperimentOffer]:
 def _with_back(
     like: Path, bars: list[Path], make: Callable[[F2, float, str], CaseRun], start: float, label: str, q_mm: F2 | None = None
 ) -> tuple[CaseRun, ...]:
-    """Return a run along a path and, if the campaign has both directions, one back along it."""
+    """Return a run along a path and, if the campaign has both directions, a run back along this path."""
     q = like.at.q_mm if q_mm is None else q_mm
     out = [make(q, start, label)]
     if not one_way(bars):
@@ -314,7 +314,7 @@ def _again(p: Path, start: float, label: str, machine: Machine) -> CaseRun:
 def blind_spots(case: Case) -> tuple[BlindSpot, ...]:
     """Return the blind spots of a campaign's identify runs, each with the measurement that would cover it.
 
-    Other runs do not count, because the search does not use them.
+    Runs with other roles do not count, because the search does not use them.
     """
     paths = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in paths if p.kind == "bar"], [p for p in paths if p.kind == "laser"]
@@ -351,7 +351,7 @@ def _repeated_late(paths: list[Path]) -> bool:
 
 
 def _place(path: Path) -> F1:
-    """Return numbers, mm, that identify a path in either direction: extent, and cup and radius of a bar or scaled direction of a beam."""
+    """Return numbers, mm, that identify a path in either direction: extent, and a bar's cup and radius or a beam's scaled direction."""
     reach = [path.at.q_mm.min(axis=0), path.at.q_mm.max(axis=0)]
     if path.kind == "bar":
         return np.concatenate([*reach, path.centre_mm, [path.radius_mm]])

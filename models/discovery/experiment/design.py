@@ -1,8 +1,8 @@
 """Experiment design: the addition that best separates the remaining suspects, by simulation (T-optimal design, Atkinson and Fedorov).
 
-For every addition that the campaign lacks, each rival is fitted to the leading suspect's signal over old and new runs, with all unknowns
+For every addition that the campaign lacks, each rival is fitted to the leading suspect's signal over old and new runs. All unknowns are
 free: the rival's coefficients, the present simulation, the set-ups. The norm of the residual, in sigmas of the noise, is the expected
-separation. The addition with the largest gain per minute is proposed; those that separate all rivals by ball-bar or laser come first.
+separation. The addition with the largest gain per minute is proposed; additions that separate all rivals by ball-bar or laser come first.
 """
 
 from __future__ import annotations
@@ -22,11 +22,11 @@ from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path, Places
 
 THIN = 100
-"""Approximate number of readings kept of each old run; each also represents those left out."""
+"""Approximate number of readings kept of each old run; each also represents readings left out."""
 ENOUGH = 5.0
 """Separations above this many sigmas count as this many."""
 WORTH, LEAST = 2.0, 0.02
-"""Added sigmas from which a test is worth its time; added sigmas below which it is useless."""
+"""`WORTH`: least gain in sigmas of a test that is worth its time. `LEAST`: a test that gains fewer sigmas is useless."""
 NOISE_MM = {"bar": 4e-4, "laser": 3e-4}
 LENGTH_MM = 3e-4
 SEPARATED = 4.0
@@ -43,7 +43,7 @@ class SuspectEffect:
     Attributes
     ----------
     coefficients : array, shape (k,)
-        Fitted coefficients, used only for the leading suspect. None: those of typical strength (`usual`).
+        Fitted coefficients, used only for the leading suspect. None: coefficients of typical strength (`usual`).
     """
 
     effect: Effect
@@ -59,7 +59,7 @@ class SuspectEffect:
 
 @dataclass(frozen=True)
 class Prospect:
-    """Expected separation of the leading suspect from each rival, in sigmas, with an addition (``sigmas``) and without it (``already``)."""
+    """Expected separation of the leading suspect from each rival, sigmas, with an addition (``sigmas``) and without it (``already``)."""
 
     offer: ExperimentOffer
     sigmas: F1
@@ -97,7 +97,7 @@ def propose(
     Returns
     -------
     NextTest or None
-        None without rivals, or if no addition separates them by `LEAST` sigmas more. If none adds `WORTH` sigmas, the best addition.
+        None without rivals, or if every addition gains less than `LEAST` sigmas. If every addition gains less than `WORTH`, the best one.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:
@@ -178,7 +178,7 @@ class _Columns:
         return cls(base, tuple(np.asarray(s @ c) for s in own), found)
 
     def gram(self, run: CaseRun, k: int, weight: float, subtracted: tuple[CaseRun, int] | None = None) -> F2:
-        """Normal matrix of run number k (simulation, rivals, leader). ``subtracted``: a run whose columns to subtract, and its number."""
+        """Normal matrix of run number k (simulation, rivals, leader). ``subtracted``: run, and its number, whose columns are subtracted."""
         columns = self._of_run(run, k)
         if subtracted is not None:
             columns = columns - self._of_run(*subtracted)
@@ -189,7 +189,7 @@ class _Columns:
         return np.column_stack([jacobian, *(r[k] for r in self.rivals), self.leader[k]])
 
     def left(self, gram: F2, *, knows_length: bool = False) -> F1:
-        """Norm of the part of the leader's signal that each rival and the simulation together cannot imitate, sigmas, shape (rivals,)."""
+        """Norm of the part of the leader's signal that the simulation together with each rival cannot imitate, sigmas, shape (rivals,)."""
         n, out = self.base.size, []
         sd = self.base.prior_sd * WIDE
         if knows_length:
@@ -208,7 +208,7 @@ class _Columns:
 
 
 def usual(suspect: SuspectEffect, columns: int) -> F1:
-    """Return coefficients (columns,) of typical strength: only the first is not 0; the strength may be any power of it."""
+    """Return coefficients (columns,) of typical strength; only the first is not 0. The strength may be any power of this coefficient."""
     effect = suspect.effect
     sizes = [abs(effect.strength(c * effect.per_unit * np.eye(columns)[0], suspect.values)) / effect.per_unit for c in (1.0, 4.0)]
     power = np.log(sizes[1] / sizes[0]) / np.log(4.0)

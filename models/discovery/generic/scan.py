@@ -1,6 +1,6 @@
 """Starts of the search for unnamed structures: the few positions, times and periods at which the residuals stand out.
 
-A step may occur at any time and a wave may have any period. That makes thousands of starts, too many to project the present simulation out
+A step may occur at any time and a wave may have any period. These are thousands of starts, too many to project the present simulation out
 of each column. Only the norm of a column needs this projection; its inner product with the (already projected) residual does not. So a scan
 with approximate norms finds the best starts, which then compete with their exact columns.
 """
@@ -38,7 +38,7 @@ class ScanResult:
         return ScanResult(tuple(self.paths[k] for k in which), tuple(self.rest[k] for k in which), tuple(self.sigma_mm[k] for k in which))
 
     def stacked(self) -> tuple[F1, F2, F1]:
-        """Return for all readings: time, s; direction of bar or beam over noise, shape (n, 3), 1/mm; whitened residual."""
+        """Return for all readings: time, s; direction of bar or beam divided by the noise, shape (n, 3), 1/mm; whitened residual."""
         look = np.concatenate([p.look / s for p, s in zip(self.paths, self.sigma_mm, strict=True)])
         return np.concatenate([p.at.t_s for p in self.paths]), look, np.concatenate(self.rest)
 
@@ -55,7 +55,7 @@ def best(score: F1, count: int, apart: int) -> list[int]:
 
 
 def step_instants(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
-    """Return the best times of a step, s, by axis; key ``""``: for a step in any direction.
+    """Return the best times of a step, s, by axis; key ``""``: times of a step in any direction.
 
     A step lasts until the end of a ball-bar set-up or of a laser run, because each laser run sets its zero anew.
     """
@@ -106,7 +106,7 @@ def pitches(scanned: ScanResult, count: int) -> dict[str, tuple[float, ...]]:
 def _wave_gain(low: float, high: float, step: float, x: F1, columns: F2, rest: F1, bin_size: float) -> tuple[F1, F2]:
     """Return frequencies, and the reduction of chi-square by a wave in ``x`` of each frequency, shape (columns, frequencies).
 
-    It comes from a Fourier transform of the readings binned in ``x``, with norms of unprojected columns.
+    The method is a Fourier transform of the readings binned in ``x``, with norms of unprojected columns.
     """
     length = np.sum(columns**2, axis=0) / 2.0 + 1e-12
     cell = ((x - x.min()) / bin_size).astype(np.intp)

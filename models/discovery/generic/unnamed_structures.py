@@ -1,7 +1,7 @@
 """Structures without a name: generic effects that compete with the catalogue in the same search; if they win, the verdict is "unknown".
 
-Each describes a kind of deviation (a step, a wave, a bump), whatever its cause. Without them, four of five effects outside the catalogue
-would get a wrong name. A key names the axis (``"X"``) or the error motion (``"EYX"``: along X in direction Y).
+Each structure describes a kind of deviation (a step, a wave, a bump) of any cause. Without these structures, four of five effects outside
+the catalogue would get a wrong name. A key names the axis (``"X"``) or the error motion (``"EYX"``: along X in direction Y).
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ SMOOTH_ORDERS = (2, 3, 4, 5, 6)
 ODD_ORDERS = (1, 2, 3)
 """Order 0 is left out: a jump at every reversal has a name (lost motion), which a structure with order 0 would replace."""
 ARM_MM = 300.0
-"""Rotations of a slip are stated as displacements at this distance, so that all its columns are in micrometres."""
+"""Rotations of a slip are stated as displacements at this distance, so that all columns of a slip are in micrometres."""
 PREFIX = "unnamed_"
 COMPONENTS = tuple(f"E{d}{a}" for a in AXES for d in AXES)
 CROSS = tuple(key for key in COMPONENTS if key[1] != key[2])
@@ -53,7 +53,7 @@ def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Return columns as `smooth`, but of orders 1 to 3 and times the direction in which the axis last moved."""
+    """Return columns as `smooth` does, but of orders 1 to 3 and multiplied by the direction in which the axis last moved."""
 
     def deviation(p: Path, at: Places) -> F3:
         return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
@@ -122,13 +122,13 @@ def place_at(paths: tuple[Path, ...], at_s: float) -> F1:
 
 
 def lobes(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Return columns of an out-of-round ball: for ``"Z3"`` three lobes around Z, a wave in the bar's azimuth equal at every latitude."""
+    """Return columns of an out-of-round ball: for ``"Z3"`` three lobes around Z (a wave in the bar's azimuth, equal at all latitudes)."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
 
 def lobe_latitude(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Return columns of a form of `lobes`: their height changes linearly with the sine of the bar's latitude."""
+    """Return columns of lobes (`lobes`) whose height changes linearly with the sine of the bar's latitude."""
     polar, number = AXES.index(key[0]), int(key[1:])
     return [UM * _lobed(p.look, polar, number) * p.look[:, polar, None] if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
@@ -264,7 +264,7 @@ def _coarse(paths: tuple[Path, ...]) -> Starts:
 
 
 def _apart(paths: tuple[Path, ...]) -> tuple[Path, ...]:
-    """Return one run of every different path, because runs back or at another feed pass the same positions."""
+    """Return one run of every different path: runs back, or at another feed, pass the same positions."""
     distinct: dict[tuple[float, ...], Path] = {}
     for p in paths:
         distinct.setdefault((*p.centre_mm, p.radius_mm, *np.round(np.ptp(p.at.q_mm, axis=0)), *np.round(p.look[0], 2) ** 2), p)

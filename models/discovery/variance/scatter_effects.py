@@ -1,8 +1,8 @@
 """Effects in the variance of the readings, not in their mean: vibration, stick-slip, outliers of a laser, bursts of interference.
 
-Each is tested on whitened residuals against uniform scatter. The evidence is a log likelihood ratio less its price, on the scale of half a
-chi-square; an effect is named when its evidence is positive. Prices account for the number of trials (frequencies, axes, windows): noise
-alone gets a given effect named in less than 3 of 1000 campaigns.
+Each effect is tested on whitened residuals against uniform scatter. The evidence is a log likelihood ratio minus a price, on the scale of
+half a chi-square; an effect is named when its evidence is positive. The price accounts for the number of trials (frequencies, axes,
+windows), so that noise alone leads to a given name in less than 3 of 1000 campaigns.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ SCALES = np.linspace(0.75, 1.1, 15)
 """Tried ratios of the good readings' noise to its robust estimate; with a fixed ratio, a wrong noise would look like outliers."""
 UM = 1e3
 NAME_PRICE = 7.0
-"""Price of a name in log likelihood, beside the log of the number of trials: noise alone gains this with a probability of about exp(-7)."""
+"""Price of a name in log likelihood, added to the log of the number of trials: noise alone gains this with probability exp(-7) or so."""
 OFF, PLACE_Z = 3.5, 4.0
 """`OFF`: a reading this many standard deviations off is an outlier. `PLACE_Z`: if the readings near outliers deviate by this many, the
-position is the cause and not a lost beam (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
+cause is the position and not a lost beam (13 campaigns with lost beams had at most 1.2, three with a bump at least 4.2)."""
 LEAST_INSIDE, LEAST_RUNS, IN_RUNS, ROUGHER = 12, 3, 0.75, 1.2
 """Least values for a rough place: readings of a run inside and outside of it, number of such runs, share of them that show the place, and
 ratio of the variances."""
@@ -63,15 +63,15 @@ CREEP_MM_S = 4.5
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
     """Find out whether laser outliers belong to a position: return the common deviation of other readings near them, and that position.
 
-    The deviation is in standard deviations, the position in mm, shape (3,). A lost beam affects no other readings nearby; their common
-    deviation is then within 3.
+    The deviation is in standard deviations, the position in mm, shape (3,). A lost beam does not affect the readings nearby, so their
+    common deviation is then within 3.
 
     Parameters
     ----------
     q_mm : array, shape (n, 3)
         Tool positions.
     rest : array, shape (n,)
-        Whitened residuals; exact zeros are not readings.
+        Whitened residuals; exact zeros mark missing readings.
     off : array of bool, shape (n,)
         True for outliers.
     """
@@ -160,21 +160,21 @@ def extra_variance(
     colours: Mapping[str, Colour] | None = None,
     alone: tuple[F1, ...] | None = None,
 ) -> tuple[VarianceFinding, ...]:
-    """Find variance effects with positive evidence that no stronger one explains; at most one of vibration and stick-slip per axis.
+    """Find variance effects with positive evidence that no stronger effect explains; per axis at most one of vibration and stick-slip.
 
     Parameters
     ----------
     paths : runs.
     whitened : one array (n,) per run
-        Whitened residuals of the mean model with all found effects; unit variance for noise alone. They must include outliers; exact zeros
-        count as no reading.
+        Whitened residuals of the mean model with all found effects, of variance 1 for noise alone. They must include outliers; exact zeros
+        mark missing readings.
     sigma_mm : noise of one reading of each run.
     leverage : one array (n,) per run, optional
         Share of each reading's noise that the fit absorbed.
     colours : Colour by "bar" and "laser", optional
         Noise with which the residuals were whitened; default: white noise.
     alone : one array (n,) per run, optional
-        1 for single wrong readings (`abbe.models.discovery.instrument_noise.lone`); those of a ball-bar count as outliers and rough places.
+        1 for single wrong readings (`abbe.models.discovery.instrument_noise.lone`); a ball-bar's are tested as outliers and rough places.
 
     Returns
     -------
@@ -331,7 +331,7 @@ def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple
 
 
 def _two_levels(runs: list[tuple[F1, NDArray[np.bool_]]]) -> tuple[float, float]:
-    """Gain in log likelihood of two levels of noise over one, and their ratio; squared readings, and whether they are inside, by run.
+    """Return the gain in log likelihood of two levels of noise over one, and their ratio, from squared readings inside and outside, by run.
 
     The largest `FEW` squares of a run do not count.
     """
@@ -343,10 +343,10 @@ def _two_levels(runs: list[tuple[F1, NDArray[np.bool_]]]) -> tuple[float, float]
 
 
 def _bar_outliers(paths: tuple[Path, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
-    """Name single wrong readings of a ball-bar from some of them on (`LEAST_OFF`).
+    """Name single wrong readings of a ball-bar if there are at least `LEAST_OFF`.
 
     ``off``: whitened residuals of these readings (`abbe.models.discovery.instrument_noise.lone`), one array (n,) per run, all others zero.
-    Their evidence is that of normal noise against noise as wide as they are.
+    The evidence compares normal noise with noise as wide as these readings.
     """
     sizes = np.concatenate([o[o != 0.0] * s for o, s in zip(off, sigma_mm, strict=True)])
     sigmas = np.concatenate([o[o != 0.0] for o in off])

@@ -21,7 +21,7 @@ PADDING = 4
 LOW_CYCLES, PER_TURN = 6.0, 2.0
 """Aliased frequencies below this many cycles per run plus this many per turn of the bar count as residues of the mean model."""
 LOBES_PER_TURN = 12.0
-"""Up to this many cycles per turn of the bar, a line may come from the form of balls or machine; such a run does not prove a line."""
+"""Up to this many cycles per turn of the bar, a line may come from the form of balls or machine; runs in this range do not prove a line."""
 REGULAR = 0.02
 """Sampling counts as regular when its steps differ by less than this fraction."""
 TOP = 24
@@ -33,7 +33,7 @@ LEAST_READINGS = 12.0
 ALIKE = 1.94
 """Divisor for squared second differences, which are correlated from reading to reading for white noise."""
 FEW = 3
-"""The gain of this many best readings does not count: a reversal that the mean model misses by one reading is not roughness."""
+"""The gain of this many largest readings does not count, because a reversal that the mean model misses by one reading is not roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
 
 
@@ -56,8 +56,8 @@ class SpectralLine:
 class _Spectrum:
     """Spectrum of one run over aliased frequencies 0 to ``rate_hz``; r: residuals, u_a: the bar's direction cosine along the axis.
 
-    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both zero where a frequency does not count. ``proves``: whether
-    a line at this frequency is too fast for a form of balls or machine that the bar passes once per turn (`LOBES_PER_TURN`).
+    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both are zero at frequencies that do not count. ``proves``:
+    whether a line at this frequency is too fast to come from the form of balls or machine (`LOBES_PER_TURN`).
     """
 
     rate_hz: float
@@ -146,7 +146,7 @@ def _turns_of_bar(path: Path) -> float:
 
 
 def _noise_power(f: F1, colour: Colour) -> F1:
-    """Return the noise power at frequencies f (cycles per reading) over that of white noise with the same variance."""
+    """Return the noise power at frequencies f (cycles per reading) divided by that of white noise with the same variance."""
     s, m = colour.share, colour.memory
     return np.asarray(1.0 - s + s * (1.0 - m * m) / (1.0 - 2.0 * m * np.cos(2.0 * np.pi * f) + m * m))
 
@@ -271,7 +271,7 @@ def _likelihood(square: F1, columns: F2, start: F1) -> F1:
 
 
 def loud_windows(paths: tuple[Path, ...], rest: tuple[F1, ...]) -> tuple[float, float, int, float, float, float] | None:
-    """Find the window with the most scatter: gain, windows tried, index of run, middle (s), half length (s), extra variance over noise."""
+    """Find the window with most scatter; return gain, windows tried, index of run, middle, half length (s), extra variance over noise."""
     best: tuple[float, float, int, float, float, float] | None = None
     tried = 0.0
     for k, (p, r) in enumerate(zip(paths, rest, strict=True)):
