@@ -1,8 +1,8 @@
-"""Influence of the active compensation table on the readings of a run, less the part that lost motion absorbs.
+"""Influence of the active compensation table on the readings of a run, without the part that lost motion absorbs.
 
 A table moves the drives away from the command. Where its corrections change while an axis is commanded to rest, the drive moves by a
-micrometre or two and reverses although the command does not. Within the lost motion the axis does not follow, or only partly. A solver
-that sees only the commands finds an error of a few micrometres there which no smooth error motion explains.
+micrometre or two and reverses although the command does not. Within the lost motion the axis does not follow, or only partly. There a
+solver that sees only the commands finds an error of a few micrometres that no smooth error motion explains.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class AppliedTables:
     def moved_mm(self, axes_mm: F2) -> F2:
         """Displacement of the axes by the table at successive commands, shape (n, 3), mm.
 
-        It is the correction minus the part that lost motion absorbs. The reference is the same machine without a table: there each axis
+        This is the correction minus the part that lost motion absorbs. The reference is the same machine without a table, where each axis
         ends on the side of its lost motion from which it came.
         """
         added = self.correction(axes_mm)

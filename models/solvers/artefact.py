@@ -10,8 +10,8 @@ x axis coordinates, N nominal place of the feature, D machine's deviation at x w
 
 Unknowns: ``pose_<setup>_x/y/z`` (mm), ``turn_<setup>_a/b/c`` (rad, artefact axes), ``sway_<setup>_x/y/z`` (mm/s, drift of the pose);
 ``form_<artefact>_<feature>_x/y/z`` (mm, directions that were sensed), ``scale_<artefact>`` (free unless a length is calibrated),
-``expansion_<artefact>`` (1/K, beside the stated one), ``warmth_<artefact>`` (K, of the sensor), ``twist_<artefact>_0..5`` (mm at
-the farthest feature: rotation or scale growing with r^2, bends; what clamping or springing back leaves in a workpiece),
+``expansion_<artefact>`` (1/K, added to the stated one), ``warmth_<artefact>`` (K, of the sensor), ``twist_<artefact>_0..5`` (mm at
+the farthest feature: rotation or scale growing with r^2, bends; clamping or springing back leaves them in a workpiece),
 ``shear_<artefact>_stretch/square`` (mm there: of the artefact, or of the
 CMM), ``cmm_<artefact>`` (its scale), ``stylus_<source>`` (mm),
 ``lobing_<direction>_x/y/z`` (mm, machine axes: shift of touches that start in this direction; of a wall with this normal: pre-travel),
@@ -140,16 +140,16 @@ class ArtefactPriors:
 
     Attributes
     ----------
-    pose_mm, turn_rad : stated against true pose; wide, because a pose is typed in.
+    pose_mm, turn_rad : true minus stated pose; wide, because a person types the pose.
     sway_mm_s : drift of the pose: 0.3 um in 10 minutes.
-    form_mm : place of a feature against its nominal one; the size is estimated from the data.
-    scale : of an artefact without a calibrated length.
+    form_mm : true minus nominal place of a feature; this size is estimated from the data.
+    scale : scale of an artefact without a calibrated length.
     shear : difference in scale of the artefact's two axes, and its squareness: errors of the machine that made it.
-    twist_mm : smooth form; estimated from the data.
+    twist_mm : smooth form; this size is estimated from the data.
     stylus_mm : radius of stylus with pre-travel, or of the cutter.
-    lobing_mm : estimated from the data.
-    clamp_mm, warp_mm : bend of the artefact in a pose by clamping and weight, in its plane and out of it; estimated from the data.
-    nugget_mm, wave_mm : fine structure of a machine's motion; the first is estimated from the data.
+    lobing_mm : lobing of the probe; this size is estimated from the data.
+    clamp_mm, warp_mm : bend of the artefact in a pose by clamping and weight, in its plane and out of it; sizes estimated from the data.
+    nugget_mm, wave_mm : fine structure of a machine's motion; the first size is estimated from the data.
     warmth_K : offset of the temperature sensor, the same in all runs of the artefact.
     """
 
@@ -208,9 +208,9 @@ def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPrior
 def lobing(p: ArtefactPoints) -> list[tuple[str, F1]]:
     """Lobing unknowns with their column in the reading, shape (n,).
 
-    Without a stated direction of the first touch all points of a run are shifted alike, which the pose takes up. Each further direction
-    shifts its points by a vector of its own in machine axes, since the probe does not turn with the artefact. A wall is touched along its
-    normal, so each direction in the machine has its own pre-travel.
+    Without a stated direction of the first touch, all points of a run are shifted alike, and the pose absorbs this shift. Each further
+    direction shifts its points by its own vector in machine axes, since the probe does not turn with the artefact. A wall is touched along
+    its normal, so each direction in the machine has its own pre-travel.
     """
     along = np.asarray(p.matrix.T[p.component])  # machine direction of every row
     wall = p.normal.any(axis=1)
@@ -266,7 +266,7 @@ class ArtefactReading:
         return [f"pose_{s}_{k}" for k in LETTERS], [f"turn_{s}_{k}" for k in TURNS], [f"sway_{s}_{k}" for k in LETTERS]
 
     def _own(self) -> tuple[F2, F1]:
-        """Places of the features on the true artefact without the machine's deviation, (n, 3), and 1 + scale, (n,)."""
+        """Places of the features on the true artefact, without the machine's deviation, (n, 3); and 1 + scale, (n,)."""
         return _place(self.points, self.known, self.points.feature, self.points.nominal_mm)
 
     def reading(self) -> F1:
@@ -369,14 +369,14 @@ def form_rows(p: ArtefactPoints, features: Sequence[str], nominal_mm: F2, names:
 
 
 def _expansion(p: ArtefactPoints, known: Known) -> tuple[float, F1]:
-    """Expansion per K, and temperature that makes each reading longer: a probed artefact is warm; a workpiece was warm when it was made."""
+    """Expansion per K, and temperature that makes each reading longer: of a probed artefact now, of a workpiece when it was made."""
     more, offset = known.get(f"expansion_{p.artefact}", f"warmth_{p.artefact}")
     sensed = p.warm_K if p.source == "length" else p.warm_K + offset
     return p.expansion_per_K + float(more), -sensed if p.source == "cmm" else sensed
 
 
 def _place_slopes(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nominal_mm: F2, back: F2, moved: F2) -> dict[str, F1]:
-    """Derivatives of readings by form, scale, expansion and CMM; ``back``: their derivative by the place; ``moved``: deviation (CMM)."""
+    """Derivatives of readings by form, scale, expansion and CMM; ``back``: derivative of readings by place; ``moved``: deviation (CMM)."""
     out: dict[str, F1] = {}
     for i, f in enumerate(feature):
         for k in range(3):
@@ -406,7 +406,7 @@ def step_columns(p: ArtefactPoints, after: NDArray[np.bool_]) -> F2:
 
 
 def _bends(p: ArtefactPoints, setup: str) -> dict[str, F2]:
-    """Bends of second degree of an artefact in one pose, 1 at its farthest feature, shape (n, 3): in its plane, and out of it (warp)."""
+    """Second-degree bends of an artefact in one pose, 1 at its farthest feature, shape (n, 3): in its plane, and out of it (warp)."""
     x, y, _ = ((p.nominal_mm - p.middle_mm) / p.reach_mm).T
     out = {}
     for i, value in enumerate((x * x, x * y, y * y)):

@@ -1,5 +1,5 @@
 """Faults in the measurement of an artefact: exchanged features, a pose that is a quarter turn off, an artefact that moved, a false
-trigger, a wrong radius, a part that twists. Each is named, and corrected where the readings determine the correction."""
+trigger, a wrong radius, a part that twists. Each fault is named, and corrected if the readings determine the correction."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from abbe.models.solvers.observations import RunData
 
 Settle = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
 OTHER_PLACE_MM = 1.0
-"""A feature found farther than this from its nominal place is taken for the feature that lies there, if one does."""
+"""A feature found farther than this from its nominal place is taken for the feature whose nominal place is there, if there is one."""
 NOISY, STRONG = 4.0, 25.0
 """`NOISY`: poses are doubted if their points scatter by this multiple of the repeatability. `STRONG`: least gain of log evidence that
 proves a fault.
@@ -28,8 +28,8 @@ proves a fault.
 STEP_MM, STEP_RAD = 0.02, 1e-4
 """Prior size of a motion of the artefact during a run."""
 QUIETER, GROSS_SIGMA = 1.5, 50.0
-"""`QUIETER`: a run is split if this divides the scatter of its points by this factor or more. `GROSS_SIGMA`: largest size, in standard
-deviations, with which one point counts in this scatter."""
+"""`QUIETER`: a run is split if the split divides the scatter of its points by this factor or more. `GROSS_SIGMA`: largest size, in
+standard deviations, with which one point counts in this scatter."""
 DOUBTED = 0.5
 """A point whose robust weight is below this is doubted."""
 STEPS = np.array([STEP_MM] * 3 + [STEP_RAD] * 3)
@@ -38,7 +38,7 @@ FALSE_TRIGGER_MM, FALSE_TRIGGERS = 0.01, 3
 MOST = 0.3
 """Least share of an artefact's form that the rotation growing with r^2 must explain, for a twist to be named."""
 RADIUS_MM, TWIST_MM, SIGMA = 8e-3, 6e-3, 4.0
-"""Least wrong radius and twist that are named, and by how many standard uncertainties they must differ from zero."""
+"""Smallest error of the radius and smallest twist that are named; number of standard uncertainties by which they must differ from zero."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ def _scatter(problem: CampaignProblem, fit: CampaignFit, label: str) -> float:
 def _quarter_turn(
     runs: tuple[RunData, ...], fit: CampaignFit, settle: Settle
 ) -> tuple[tuple[RunData, ...], CampaignProblem, CampaignFit, ArtefactFault] | None:
-    """Turn the one run by quarter turns that makes all forms agree best; None if the solution is not clearly better then."""
+    """Turn one run by quarter turns, so that all forms agree best; None if this does not make the solution clearly better."""
     tried = [(i, quarter, turned_run(run, quarter)) for i, run in enumerate(runs) for quarter in (1, 2, 3)]
     changed = [(i, quarter, (*runs[:i], other, *runs[i + 1 :])) for i, quarter, other in tried if other is not None]
     if not changed:
@@ -137,7 +137,7 @@ def _quarter_turn(
 
 
 def _disagreement(runs: tuple[RunData, ...]) -> float:
-    """Sum of squares by which the forms in the runs differ, each without its best-fit affine map; all runs have the machine's errors."""
+    """Sum of squares by which the forms in the runs differ, each without its best-fit affine map; the machine adds the same to each."""
     seen: dict[tuple[str, int], list[float]] = {}
     for p, deviation in ((r.points, r.deviation_mm) for r in runs if r.points is not None and r.points.source != "length"):
         for k in np.unique(p.component):
@@ -150,7 +150,7 @@ def _disagreement(runs: tuple[RunData, ...]) -> float:
 
 
 def turned_run(run: RunData, quarter: int) -> RunData | None:
-    """Return a run as if the artefact lay some quarter turns further about its centre; None if its features do not fall on each other."""
+    """Return a run as if the artefact lay some quarter turns further about its centre; None if no feature then lies at another's place."""
     p = run.points
     if p is None or p.source == "length":
         return None
@@ -277,7 +277,7 @@ def _twist(joint: JointSolution) -> list[ArtefactFault]:
 
 
 def _share(p: ArtefactPoints, places: dict[str, F1], theta: F1, names: tuple[str, ...], value: float) -> float:
-    """Share of the form's sum of squares that its swirl makes; 1 for a workpiece, whose form is smooth."""
+    """Share of the swirl in the form's sum of squares; 1 for a workpiece, whose form is smooth."""
     at = {n: i for i, n in enumerate(names)}
     rows = [[at.get(f"form_{p.artefact}_{f}_{k}") for k in "xy"] for f in places]
     if any(row is None for pair in rows for row in pair):

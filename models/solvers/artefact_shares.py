@@ -31,7 +31,7 @@ Verdict = Literal["with the part", "with the machine", "with both", "unknown", "
 
 @dataclass(frozen=True)
 class Share:
-    """A field's amount at ``reach_mm`` from the centre, mm: of the part and of the machine, their standard uncertainties, evidence.
+    """A field's amount in the part and in the machine at ``reach_mm`` from the centre, mm, with standard uncertainties and evidence.
 
     ``both_mm``, ``u_both_mm``: the reading of the part on this machine (part minus machine, as a probe reads it).
     """

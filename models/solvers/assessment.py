@@ -1,4 +1,4 @@
-"""Report of what a campaign determines about a machine and what it does not, before it is measured or after it is solved.
+"""Report of what a campaign determines about a machine and what it leaves open, before the measurement or after the solution.
 
 `observability` needs only the runs' set-ups and positions, for planning; `observability_of` takes a solution. Both give the rank, hidden
 combinations as text with cause and cure, the status of every parameter and motion, and the uncertainty of the deviation in the volume. The
@@ -64,7 +64,7 @@ class Observability:
     known : tuple of str
         Set-up unknowns that count as known for the rank, because a run or the caller states them.
     hidden : tuple of HiddenGroup
-        The null space in words; combinations that move nothing with the tools used come last.
+        The null space in words; combinations that do not move any of the tools used come last.
     advice : tuple of Advice
         Additions to the campaign, each the most useful after the previous ones, with the rank after each.
     parameters, correlations, motions
@@ -72,7 +72,7 @@ class Observability:
     knowing : Knowing
         Covariances of the coefficients of ``model``.
     volume : Volume
-        On a grid of 11 nodes per axis. Other points: `at`.
+        Figures on a grid of 11 nodes per axis; for other points see `at`.
     number : Number
         The observability number.
     """
@@ -102,7 +102,7 @@ class Observability:
         return volume_at(self.machine, self.model, self.knowing, axes_mm)
 
     def plane(self, fixed: int = 2, nodes: int = 15) -> Plane:
-        """As `at`, on nodes x nodes points of the plane through the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture."""
+        """Do the same as `at` on nodes x nodes points of the plane through the middle of axis ``fixed`` (0 X, 1 Y, 2 Z), for a picture."""
         return plane_at(self.machine, self.model, self.knowing, fixed, nodes)
 
     def lines(self) -> tuple[str, ...]:
@@ -141,7 +141,7 @@ def observability(
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Standard uncertainty of one raw reading, mm, and the least one of an averaged value.
     known : Knowledge, optional
-        What is known of the set-up, for the rank; default `stated_knowledge`: what the runs themselves state.
+        Knowledge of the set-up for the rank; default `stated_knowledge`: that stated by the runs themselves.
 
     Raises
     ------
@@ -165,7 +165,7 @@ def observability(
 
 
 def observability_of(solution: JointSolution, known: Knowledge | None = None) -> Observability:
-    """Report what the runs of a solution determined: as `observability`, with the solution's estimates, covariance, priors and noise.
+    """Report what the runs of a solution determined, as `observability` does, with the solution's estimates, covariance, priors and noise.
 
     Rank and null space count the terms up to the solution's chosen order; uncertainties and shares include its higher orders too.
     """
@@ -183,7 +183,7 @@ MAP_NODES = 5
 
 @dataclass(frozen=True)
 class MapAgainstPrior:
-    """Rms length over the volume of a solution's map, of its standard uncertainty, and of a usual machine's errors by the priors, mm."""
+    """Rms lengths over the volume, mm: of a solution's map, of its standard uncertainty, and of a usual machine's errors by the priors."""
 
     predicted_mm: float
     u_mm: float
@@ -210,7 +210,7 @@ def map_against_prior(solution: JointSolution) -> MapAgainstPrior:
 
 
 def motions_of(solution: JointSolution) -> tuple[MotionStatus, ...]:
-    """Status of every error motion of a solution, as in its whole report but without computing the other parts."""
+    """Status of every error motion of a solution, as in the whole report, without computation of the other parts."""
     p = len(solution.terms)
     root = solution.prior_root[:p]
     return motions(solution.machine, solution.terms, solution.term_covariance, root @ root.T, solution.identifiability.involved)

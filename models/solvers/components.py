@@ -1,8 +1,8 @@
 """Variance components, estimated from the readings.
 
 The components are the noise of the instruments and the typical size of each class of errors. A campaign is compressed to normal equations
-of the unknowns, per fold and instrument (`InformationSums`), so later work depends on the number of unknowns (a few hundred) and not of
-readings.
+of the unknowns, per fold and instrument (`InformationSums`), so later work depends on the number of unknowns (a few hundred), not on the
+number of readings.
 
 The method is the marginal likelihood of a linear normal model (restricted maximum likelihood with weak hyperpriors), maximised by Fisher
 scoring on the logarithms: Patterson and Thompson 1971, Harville 1977; MacKay 1992 "evidence". The uncertainty of the components widens the
@@ -27,9 +27,10 @@ KINDS = ("bar", "laser", "artefact")
 NOISE_SD = 2.0
 """Weak hyperprior of an instrument's log noise variance about the expected one: a factor of e in the standard deviation."""
 LEAST_ETA: F1 = np.array([0.0 if kind == "artefact" else -8.0 for kind in KINDS])
-"""Least log ratio of noise variance to expected one by instrument. A factor of 55 in the standard deviation is below any resolution;
-readings without noise would drive it to minus infinity, and the normal equations beyond double precision. The noise of an artefact's points
-is never below their stated repeatability: with a free form, few poses would fit any scatter, even that of the touch's resolution."""
+"""Least log ratio of noise variance to expected noise variance, by instrument. A factor of 55 in the standard deviation is below any
+resolution; without a limit, readings without noise would drive the ratio to minus infinity and the normal equations beyond double
+precision. The noise of an artefact's points is never below their stated repeatability: with a free form, few poses would fit any scatter,
+even that of the touch's resolution."""
 CLEAR = 1.5
 """Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25
@@ -143,7 +144,7 @@ def total(parts: tuple[InformationSums, ...]) -> InformationSums:
 
 @dataclass(frozen=True)
 class Components:
-    """Log ratios of variances: to the documented sizes (``psi`` of `SizeModel`), to the expected noise (``eta``, per instrument)."""
+    """Log ratios of estimated to expected variances: of error sizes (``psi`` of `SizeModel`), and of noise (``eta``, per instrument)."""
 
     psi: F1
     eta: F1
@@ -217,7 +218,7 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
 
 
 def _information_shares(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
-    """Covariance times the information of each instrument; their sum is known (``hat``), so the last one is the rest."""
+    """Covariance times the information of each instrument; the sum is known (``hat``), so the last product is the remainder."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
     rest = hat
@@ -296,8 +297,8 @@ def _moved(c: Components, step: F1, model: SizeModel) -> Components:
 def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
     """`estimate`, including the correlation length of the error motions and the share of their variance at the ends of the strokes.
 
-    The smaller share is taken only if the log evidence gains `CLEAR`: without readings near the ends, a share that is too small costs
-    more than one that is too large. ``sums`` are those of the unknowns in units of their typical size.
+    The smaller share is taken only if the log evidence gains `CLEAR`: without readings near the ends, too small a share costs more than
+    too large a share. ``sums`` are those of the unknowns in units of their typical size.
     """
     usual, least = ENDS_SHARES
     best = _fit_length(sums, with_shapes(model, model.length, usual), start)
@@ -327,17 +328,17 @@ def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> t
 
 
 ROUGH_CAUTION = 0.2
-"""Share of the widening by `cautious` that counts in U of a rough machine. Its rough parts take up what the shapes of the smooth prior do
-not follow; with all of it U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps all of it at no cost."""
+"""Share of the widening by `cautious` that counts in U of a rough machine. Its rough parts absorb what the shapes of the smooth prior do
+not follow; with the whole widening U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps the whole widening at no cost."""
 
 
 def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> tuple[SizeModel, Components]:
     """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    The prior differs in two ways, neither of which matters with many readings. ``share``: share of the first that counts.
+    The prior is wider in two ways, neither of which matters with many readings. ``share``: share of the first that counts.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
-      that the readings hardly separate, the most probable sizes are too small. Without information it is at most the documented one.
+      that the readings hardly separate, the most probable sizes are too small. Without information the limit is the documented variance.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("smoothness ") for name in model.names])

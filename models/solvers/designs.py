@@ -72,7 +72,7 @@ def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[
     ----------
     parts : list of (n_k, p) arrays
     setups : list of (array (n_k, q), columns)
-        Set-up columns of each part, and the index of each one's unknown in the whole problem; equal indices share an unknown.
+        Set-up columns of each part, and for each column the index of its unknown in the whole problem; equal indices share an unknown.
     """
     width = 1 + max((c for _, columns in setups for c in columns), default=-1)
     blocks = []
@@ -101,7 +101,7 @@ def ranks(a: F2, setup: F2) -> tuple[int, int]:
 
     Returns
     -------
-    two integers, at most p: how many combinations of the machine's parameters the readings determine, and how many of them well.
+    two integers, at most p: number of combinations of the machine's parameters that the readings determine, and that they determine well.
     """
     s = singular_values(project_out(unit_columns(a)[0], setup))
     return int((s > RANK_TOLERANCE * s[0]).sum()), int((s > EFFECTIVE_TOLERANCE * s[0]).sum())
@@ -115,7 +115,7 @@ def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]
     weights : array, shape (len(support),)
         In units of the parameters, largest magnitude 1 and positive.
     trace : float
-        Size of its effect on the readings relative to that of its parts without cancellation: 0 for a null vector.
+        Size of the combination's effect on the readings, relative to that of its parts without cancellation: 0 for a null vector.
     """
     b = project_out(a[:, support], setup)
     size = np.where(np.linalg.norm(b, axis=0) > 0, np.linalg.norm(b, axis=0), 1.0)

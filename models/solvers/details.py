@@ -1,7 +1,7 @@
 """Details of a motion that neither a smooth nor a rough basis follows: one unknown per place of a step test.
 
 A screw with a lead of 10 mm, read every 40 mm, looks like a slow wave. Four step diagonals stop at the same places of each axis, so the
-deviation of a motion at such a place is common to them, and a separate unknown keeps it out of the smooth motions.
+deviation of a motion at such a place is common to all four, and a separate unknown keeps it out of the smooth motions.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ def with_details(setup: SetupUnknowns, runs: tuple[RunData, ...], priors: Priors
 
 
 def _seen(run: RunData) -> dict[str, F1]:
-    """Reading of a laser run per unit of every detail that it sees, against its first record."""
+    """Reading of a laser run, relative to its first record, per unit of every detail that the run sees."""
     assert run.beam is not None
     out: dict[str, F1] = {}
     for a, c in product(range(3), range(3)):

@@ -107,7 +107,7 @@ Progress = Callable[[str], None]
 
 @dataclass(frozen=True)
 class InstrumentNoise:
-    """Expected noise per instrument, mm: of one raw reading; least noise of an averaged value; from repeats alone (None without them)."""
+    """Noise per instrument, mm: expected for one raw reading; least for an averaged value; from repeats alone (None without them)."""
 
     sigma_mm: dict[str, float]
     floor_mm: dict[str, float]
@@ -221,7 +221,7 @@ def _robust_scale(size: F1, kind: I1) -> F1:
 
 
 def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
-    """Weights of the readings: redescending; if ``gentle`` and with gross outliers, Huber's, so that a bad start rejects nothing good."""
+    """Weights of the readings: redescending; Huber's if ``gentle`` and with gross outliers, so that a bad start rejects no good reading."""
     hard = outlier_weights(size, limit)
     if gentle and (hard == 0.0).any():
         return np.asarray(np.minimum(1.0, HUBER / np.maximum(np.abs(size), HUBER)))
@@ -229,7 +229,7 @@ def _weights(size: F1, limit: float, *, gentle: bool) -> F1:
 
 
 def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, sizes: SizeModel) -> F1:
-    """Standard deviation of each residual in units of its noise, below 1 by the leverage."""
+    """Standard deviation of each residual in units of its noise; the leverage makes it smaller than 1."""
     information, _, _ = blend(whole.turned(sizes.root, sizes.turned), c, c.half(sizes))
     np.fill_diagonal(information, information.diagonal() + 1.0)
     low = scipy.linalg.cholesky(information, lower=True)
@@ -240,7 +240,7 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
 def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Grams) -> CampaignFit:
     """Solve a last time with the exact residuals; correlated neighbours count as fewer readings.
 
-    The estimate is that of the cautious prior. The covariance of a rough machine is that of a narrower one (`ROUGH_CAUTION`).
+    The estimate is that of the cautious prior. The covariance of a rough machine is that of a narrower prior (`ROUGH_CAUTION`).
     """
     r, typical = problem.readings, problem.sizes.typical
     residual = problem.measured - problem.predicted(typical * x)
@@ -268,7 +268,7 @@ def _solved(whole: InformationSums, sizes: SizeModel, c: Components) -> tuple[Co
 
 
 def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) -> InformationSums:
-    """Normal equations of some readings of the converged solution, to be taken off those of all (`InformationSums.minus`)."""
+    """Normal equations of some readings of the converged solution, to be subtracted from those of all (`InformationSums.minus`)."""
     r = problem.readings
     a, kind, weight = r.a[rows], r.kind[rows], fit.weight[rows] / fit.decimation[r.kind[rows]]
     y = fit.residual_mm[rows] / problem.sigma[rows] + a @ (fit.theta / problem.sizes.typical)
@@ -282,10 +282,10 @@ def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) 
 
 
 def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:
-    """Score for further terms whose variance the fit takes as zero, in standard deviations of the score without them.
+    """Score for further terms, whose variance the fit takes as zero, in standard deviations of the score if there are no such terms.
 
-    Positive if residuals are more alike than noise at readings where these terms are alike: the derivative of the log evidence by the
-    variance of ``terms`` (their prior: `size_model`), over the root of its expected information (Rao's score test).
+    The score is the derivative of the log evidence by the variance of ``terms`` (prior: `size_model`), divided by the root of its expected
+    information (Rao's score test). It is positive if residuals are more alike than noise at readings where these terms are alike.
     """
     sizes = size_model(problem.machine, terms, (), np.zeros(0), Priors())
     columns = np.concatenate([run_design(problem.machine, terms, r, problem.setup)[:, : len(terms)] for r in problem.runs])

@@ -22,8 +22,8 @@ from abbe.models.solvers.waves import Displacements, Peak, peaks
 
 Solve = Callable[[tuple[RunData, ...]], tuple[CampaignProblem, CampaignFit]]
 NUGGETS, NOISY = 3.0, 1.4
-"""Positions get values of their own if the score for these exceeds its expectation by `NUGGETS` standard deviations, or if the scatter of
-probed points is `NOISY` times their repeatability."""
+"""Each position gets its own value if the score for such values exceeds its expectation by `NUGGETS` standard deviations, or if the scatter
+of probed points is `NOISY` times their repeatability."""
 SURE, ROUNDS = 0.8, 3
 """After a period of at least the probability `SURE`, further ones are searched for, in at most `ROUNDS` searches."""
 
@@ -90,7 +90,7 @@ def _joined(nuggets: tuple[Fine, ...], groups: list[tuple[Fine, ...]]) -> tuple[
 
 
 def _noisy(problem: CampaignProblem, fit: CampaignFit) -> bool:
-    """Whether probed points scatter more than they repeat. A workpiece scatters by its drilling as well, so it always counts as noisy."""
+    """Whether probed points scatter more than their repeatability. Drilling adds scatter to a workpiece, which always counts as noisy."""
     sources = {r.points.source for r in problem.runs if r.points is not None}
     return "cmm" in sources or ("probe" in sources and float(np.exp(0.5 * fit.components.eta[KINDS.index("artefact")])) > NOISY)
 

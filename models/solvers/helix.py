@@ -2,8 +2,8 @@
 
 The paper fits six parameters and takes the mounting as perfect; 10 um of cup offset then looks like about 100 urad. The default here is
 the ten-parameter fit: scales EXX.1 EYY.1 EZZ.1 (mm/mm), squareness C0Y B0Z A0Z (rad), cup offset (mm), bar length error (mm). One helix
-cannot separate a common scale from the bar's length; the stated uncertainty of the bar's length is the prior that does. All figures of one
-helix hold only about its own sphere.
+cannot separate a common scale from the bar's length; the stated uncertainty of the bar's length, as prior, does. All figures of one helix
+hold only for its own sphere.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LINEAR = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")
 SETUP = ("offset_x", "offset_y", "offset_z", "bar_length")
 CONDITION_LIMIT = 45.0
 """Limit of the condition number. By the angle law a full hemisphere (nine or ten unknowns, 63 to 1000 points) has 28 to 32 with three
-turns, 58 to 68 with two, over 1900 with one. By the area law two turns stay near 30, without a warning; only the recipe's minimum of three
+turns, 58 to 68 with two, over 1900 with one. By the area law two turns have about 30, so no warning; only the recipe's minimum of three
 turns excludes them."""
 LOST = ("backlash_X", "backlash_Y", "backlash_Z")
 
@@ -53,7 +53,7 @@ class HelixSolution:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line if the condition number exceeds `CONDITION_LIMIT`, where small noise makes large errors of the parameters."""
+        """One line if the condition number exceeds `CONDITION_LIMIT`: small noise then makes large errors of the parameters."""
         if self.condition <= CONDITION_LIMIT:
             return ()
         return (
@@ -196,7 +196,7 @@ def _fit(task: _HelixTask, deviation_mm: F1, sigma: F1) -> ParameterEstimate:
 
 
 def _demanded_variance(estimate: ParameterEstimate) -> float:
-    """Factor on the stated variance that the misfit demands, because errors that the linear model cannot follow are not white noise.
+    """Factor on the stated variance to explain the misfit, because errors that the linear model cannot follow are not white noise.
 
     Neighbouring residuals of a real machine are correlated (r at lag one), so n readings are worth n (1 - r) / (1 + r). The integrated
     autocorrelation covers less, because the fit has removed the slow part from the residuals. A curvature that cup offset and slopes absorb

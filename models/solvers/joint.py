@@ -42,8 +42,8 @@ from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 
 ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, -1.0
-"""Motions are solved for with their rough parts if the score for these exceeds its expectation by so many standard deviations;
-points of artefacts are few, so less is enough."""
+"""The solution includes the motions' rough parts if the score for these parts exceeds its expectation by this many standard deviations;
+fewer are enough for points of artefacts, which are few."""
 Model = Literal["rigid6", "rigid21", "auto"]
 
 
@@ -60,7 +60,7 @@ class RunFit:
 
 @dataclass(frozen=True, eq=False)
 class JointSolution:
-    """Error motions of the machine from all runs together. Immutable, so derived results are cached with it (`kept`).
+    """Error motions of the machine from all runs together. A solution is immutable, so derived results are cached with it (`kept`).
 
     Attributes
     ----------
@@ -83,18 +83,18 @@ class JointSolution:
     weight_per_mm2 : array, shape (n,)
         Weight of every reading in ``information``, run by run: robust weight over noise variance, reduced for correlated neighbours.
     order : int
-        Highest Legendre order that held-out runs support (or the caller's). Terms above it are nuisance, so that the truncation of the
-        basis makes no interval too narrow.
+        Highest Legendre order that held-out runs support (or the caller's). Higher terms are nuisance unknowns, so that no interval is too
+        narrow because of a truncated basis.
     noise_mm, noise_repeats_mm : dict by kind
         Standard deviation of one raw reading, estimated with the solution, and from repeats alone (None without repeats).
     outliers : down-weighted readings, largest first.
     residual_tests : tests of the whitened residuals per run.
     model : "rigid6" or "rigid21"
-    order_choice : scores of all orders on left-out set-ups (model "auto": and regions); None when the caller chose.
+    order_choice : scores of all orders on left-out set-ups (model "auto": also on regions); None if the caller chose the order.
     size_factors : dict
         Ratio of estimated to documented typical size for each class of unknowns; ``length``: correlation length, strokes.
     table_factor : array, shape (p, k), or None
-        Factor of that part of the covariance of ``estimate`` which an unknown table in force during the runs causes; None: there was none.
+        Factor of the part of the covariance of ``estimate`` that comes from an unknown table active during the runs; None: there was none.
     """
 
     machine: Machine
@@ -157,7 +157,7 @@ T = TypeVar("T")
 def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatenate[JointSolution, Q], T]:
     """Cache a function of a solution and hashable arguments; its results live as long as the solution.
 
-    The results must not refer to the solution, or it would never be freed.
+    The results must not refer to the solution, or its memory would never be freed.
     """
     answers: WeakKeyDictionary[JointSolution, dict[tuple[object, ...], T]] = WeakKeyDictionary()
 
@@ -174,7 +174,7 @@ def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatena
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
     """Set-up unknowns of more than ``limit`` prior standard deviations: (name, number of standard deviations), largest first.
 
-    Such a bar length means that ball-bar and laser disagree about the length scale.
+    A bar length among them means that ball-bar and laser disagree about the length scale.
     """
     e = solution.estimate
     found = [(n, abs(e.value(n)) / prior_sd[n]) for n in e.names if n in prior_sd and abs(e.value(n)) > limit * prior_sd[n]]
@@ -197,10 +197,10 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     Parameters
     ----------
     order : int, optional
-        Highest Legendre order of the error motions. Default: chosen by held-out runs, with higher orders up to 12 as nuisance. If given,
-        there are no terms above it, so the uncertainties hold only for a machine of that order.
+        Highest Legendre order of the error motions. Default: chosen by held-out runs, with higher orders up to 12 as nuisance unknowns. If
+        given, there are no terms above it, so the uncertainties hold only for a machine of that order.
     model : "rigid6", "rigid21" or "auto"
-        Three scales and three squareness errors; 21 error motions; or the six where left-out set-ups and regions do not support more.
+        Three scales and three squareness errors; 21 error motions; or these six errors if left-out set-ups and regions do not support more.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Start values of the estimated noise: standard uncertainty of one raw reading, and least one of an averaged value. Default: from
         repeats, and the resolution.
@@ -304,8 +304,8 @@ def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:
 def _rank(problem: CampaignProblem, order: int) -> Identifiability:
     """Analyse the rank of the terms up to ``order``; higher ones are left out.
 
-    Free besides these: lost motion, and the set-up unknowns that `stated_knowledge` does not count as known. The weights of hidden
-    combinations are in units of typical sizes.
+    Lost motion is free, too, as are the set-up unknowns that `stated_knowledge` does not count as known. The weights of hidden combinations
+    are in units of typical sizes.
     """
     inside = [i for i, t in enumerate(problem.terms) if t.order <= order]
     terms, names = tuple(problem.terms[i] for i in inside), tuple(problem.names[i] for i in inside)

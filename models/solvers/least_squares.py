@@ -24,13 +24,13 @@ LEAST_SHARE = 1e-3
 def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
     """Singular value decomposition a = u @ diag(s) @ vt.
 
-    Divide and conquer (gesdd) is several times faster, but fails on some matrices with exactly dependent columns; those are left to QR
-    iteration (gesvd).
+    Divide and conquer (gesdd) is several times faster, but fails on some matrices with exactly dependent columns; QR iteration (gesvd)
+    decomposes those.
 
     Raises
     ------
     ValueError
-        Something in the matrix is not a finite number.
+        An element of the matrix is not a finite number.
     """
     try:
         u, s, vt = scipy.linalg.svd(a, full_matrices=full_matrices, check_finite=False)
@@ -173,7 +173,7 @@ class Identifiability:
     hidden : tuple of Combination
         The null space as sparse combinations.
     involved : frozenset of str
-        Parameters that take part in the null space (`taking_part`); the data alone give none of them a value.
+        Parameters that take part in the null space (`taking_part`); the data alone do not determine their values.
     """
 
     n_parameters: int

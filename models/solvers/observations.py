@@ -16,7 +16,7 @@ Test = Literal["", "helix", "circle", "diagonal", "linear", "artefact"]
 REJECT_SIGMA = 5.0
 """A reading farther from its block's median than this many robust standard deviations is left out of the block's mean."""
 LEAST_SPREAD_MM = 1e-4
-"""Resolution of a usual ball-bar: the least robust standard deviation, so that rounding makes no outliers."""
+"""Least robust standard deviation: the resolution of a usual ball-bar, so that rounding makes no outliers."""
 
 LEAST_BAR_MM = 1.0
 """No ball-bar is shorter; a position nearer to the cup is a mistake."""
@@ -58,7 +58,7 @@ class RunData:
     rejected : int
         Number of raw readings that `block_average` left out.
     start_mm : array, shape (3,), optional, for a laser
-        Commanded position at which beam and mirror met at the functional point; None: the first position here.
+        Commanded position at which beam and mirror met at the functional point; None: the first position of this run.
     mirror_turns : bool
         Whether the laser's mirror is on the tool's side and turns with it; False: it stands on the workpiece's side, and the laser moves.
     """
@@ -136,14 +136,14 @@ def _check_beam(run: RunData) -> None:
 def block_average(run: RunData, blocks: int) -> RunData:
     """Average the run to about ``blocks`` values, each the mean of up to ceil(n / blocks) consecutive readings moving in one direction.
 
-    Blocks never span a reversal, where averaging would hide lost motion; every reversal may add one value to ``blocks``. The mean is taken
-    of the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside it. A run of at
-    most ``blocks`` readings is returned unchanged.
+    Blocks never span a reversal, where averaging would hide lost motion; every reversal may add one value to ``blocks``. The averaged value
+    is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside the sphere. A run
+    of at most ``blocks`` readings is returned unchanged.
 
     The mean leaves out a reading that is farther from its block's median than `REJECT_SIGMA` times the largest of three standard
-    deviations: the noise of the whole run (second differences), the block's own spread (median absolute deviation), so that a steady change
-    within a block stays, and `LEAST_SPREAD_MM`. ``rejected`` counts the readings left out, ``weight_n`` those averaged. A block of one or
-    two readings loses none, because it does not show which one is wrong.
+    deviations: the noise of the whole run (second differences), the block's own spread (median absolute deviation; so a steady change
+    within a block stays), and `LEAST_SPREAD_MM`. ``rejected`` counts the readings left out, ``weight_n`` those averaged. A block of one or
+    two readings keeps them, because it does not show which of them is wrong.
     """
     n = run.deviation_mm.size
     size = max(1, int(np.ceil(n / blocks)))

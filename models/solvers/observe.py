@@ -1,9 +1,9 @@
 """Exact readings of a run from machine and set-up, and their derivatives (docs/explanation/conventions.md, "Readings").
 
 Unknowns of a campaign, always in this order: smooth terms, lost motion of X, Y, Z, set-up unknowns. Nothing is linearised: rotations are
-finite, the bar's reading is a length, the mirror a tilted plane that turns with the tool and that a misaligned beam meets. Helix, circle
-in any plane and partial arc are the same ball-bar reading; step diagonal, plain diagonal and single-axis line are the same laser reading.
-Only the commanded positions differ.
+finite, the bar's reading is a length, the mirror a tilted plane that turns with the tool and that a misaligned beam meets. The ball-bar
+reading is the same for helix, circle in any plane and partial arc, the laser reading for step diagonal, plain diagonal and single-axis
+line: only the commanded positions differ.
 
 Published methods (Yang and Kim; Wang) take the set-ups as perfect. Here each set-up error is an unknown with a documented prior
 (`abbe.models.solvers.priors`):
@@ -50,7 +50,7 @@ STRAIGHT_MM = 0.01
 0.5 mrad turns 0.01 mm into 5 nm; the steps of a step diagonal are millimetres."""
 NEAR_BEAM = 1e-3
 """A nominal beam may differ from a straight path by this much (components of unit vectors), because it is stated with few digits. With a
-tilted mirror this acts as a scale of the run and counts in its cosine error."""
+tilted mirror this difference acts as a scale of the run and is part of its cosine error."""
 BAR_DIGITS = 2
 
 
@@ -150,7 +150,7 @@ def _check_setups(runs: tuple[RunData, ...], tool_mm: F1 | None) -> None:
 
 
 def _same_tool(a: F1 | None, b: F1 | None) -> bool:
-    """Whether two runs can use the same tool; with another one, cup or mirror must have been mounted anew."""
+    """Whether two runs can use the same tool; with another tool, cup or mirror must have been mounted anew."""
     return a is None or b is None or float(np.abs(a - b).max()) <= SAME_PLACE_MM
 
 
@@ -265,7 +265,7 @@ class AxisPlaces:
     def rows(self, direction: F2, slope: F4, turn: F2 | None = None) -> F2:
         """Derivative of a reading in the given directions (n, 3) with respect to every term and lost motion, shape (n, terms + 3).
 
-        ``turn`` (n, 3), mm: reading per rad of the tool's rotation, whichever carriage turns it.
+        ``turn`` (n, 3), mm: reading per rad of the tool's rotation, by any carriage.
         """
         along = (direction[:, None, :] @ slope.reshape(-1, 3, 18))[:, 0, :]
         if turn is not None:
@@ -383,7 +383,7 @@ class _Bar:
         return [f"cup_{s}_{a}" for a in "xyz"], [f"bar_drift_{s}_{a}" for a in "xyz"], bar_length_name(self.run.radius_mm)
 
     def _bar(self) -> F2:
-        """From the cup to the tool, shape (n, 3), mm."""
+        """Vector from the cup to the tool, shape (n, 3), mm."""
         cup, drift, _ = self._names()
         assert self.run.centre_mm is not None
         placed = self.cup.deviation_mm(self.cup_motions)[0] + self.known.get(*cup)
@@ -412,8 +412,8 @@ class _Laser:
     """Laser reading (1 + scale) (1 + cosine) m.(P - P0) / (m.n) - nominal + zero + drift t: P actual position, P0 the first, n the beam.
 
     Normal of the mirror m = R (n + t1 e1 + t2 e2) with the nominal beam n and tilts as tangents. A mirror on the spindle turns with the
-    tool, by R of the sum of all carriages' rotations, and off the beam this shows: 50 mm times 20 urad is 1 um (Chapman, Precision
-    Engineering 27 (2003) 401).
+    tool, by R of the sum of all carriages' rotations. Off the beam this changes the reading: 50 mm times 20 urad is 1 um (Chapman,
+    Precision Engineering 27 (2003) 401).
     """
 
     run: RunData
@@ -438,7 +438,7 @@ class _Laser:
 
     @cached_property
     def _mirror(self) -> F1:
-        """Normal of the mirror where nothing turns it, shape (3,)."""
+        """Normal of the mirror without rotation of the machine, shape (3,)."""
         return self._beam + self.known.get(*self._names()[0]) @ perpendicular(self._beam)
 
     @cached_property

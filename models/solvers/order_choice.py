@@ -1,8 +1,8 @@
 """Order of the model: the number of Legendre orders, or rigid6, that predicts readings which were left out.
 
-Whole set-ups are left out in turn; for the choice between rigid6 and 21 error motions also regions of the volume: a corner, the end of a
-stroke. Left-out set-ups mostly lie where the others measured, too, so they hardly show what a model does elsewhere. Each score takes a part
-of the readings off the normal equations; nothing is solved from the start.
+Whole set-ups are left out in turn; for the choice between rigid6 and 21 error motions also regions of the volume (a corner, the end of a
+stroke), because left-out set-ups mostly lie where the others measured and hardly show how a model predicts elsewhere. Each score subtracts
+a part of the readings from the normal equations; nothing is solved from the start.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ FOLDS = 8
 RIGID6 = 0
 """Level of the model with three scales and three squareness errors only."""
 END, CORNER = 0.15, 0.3
-"""Part of the measured range that is the end of a stroke; of all three ranges together, a corner."""
+"""`END`: part of a measured range that counts as the end of the stroke. `CORNER`: part of each of the three ranges that makes a corner."""
 FEWEST = 6
 """Least number of readings of a region."""
 

@@ -1,8 +1,8 @@
 """Plain fit of one workpiece that a CMM measured: offset, rotation, scales, squareness, and rotation growing with r^2, each with its U.
 
-One plate alone does not separate the machine from the part: the fit shows the errors of both together. The uncertainty is that of a
-jackknife over sectors about the plate's centre, because neighbouring holes err alike, with the CMM and the temperature (JCGM 100; jackknife
-of groups: Tukey 1958).
+One plate alone does not separate the machine from the part: the fit shows the sum of their errors. The uncertainty comes from a jackknife
+over sectors about the plate's centre, because neighbouring holes have similar errors, and from CMM and temperature (JCGM 100; jackknife of
+groups: Tukey 1958).
 """
 
 from __future__ import annotations

@@ -24,7 +24,7 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""A reading this many standard deviations from the prediction of the rest of its run is left out; at most this fraction of a run."""
+"""A reading `OUTLIER_SIGMA` standard deviations off the prediction by its run's other readings is left out; at most `OUTLIER_SHARE` are."""
 
 
 @dataclass(frozen=True)
@@ -99,7 +99,7 @@ class Design:
 
 
 def scatter(design: Design, y: F1) -> tuple[float, NDArray[np.bool_]]:
-    """Most probable noise of one run, mm, and which of its readings are outliers, bool, shape (n,).
+    """Most probable noise of one run, mm, and a mask of its outliers, bool, shape (n,).
 
     The noise is one of `SIGMA_GRID_MM`; each reading is compared with the prediction of all others of the run.
     """
@@ -143,7 +143,7 @@ WIDE = Priors(
 ORDER = 10
 BLOCKS = 120
 STRONG, NAMED = 25.0, 5.0
-"""Least gain of natural log evidence: to suspect a run; to prefer a named cause to "other"."""
+"""Least gain of natural log evidence: `STRONG` to suspect a run, `NAMED` to prefer a named cause to "other"."""
 FACTORS = {"um": 1e-3, "inch": 25.4, "sign": -1.0, "mm_as_um": 1e3, "mm_as_inch": 1.0 / 25.4}
 """Factors that correct deviations written in another unit or with the other sign."""
 SWAPS = {"swap_xy": (0, 1), "swap_yz": (1, 2), "swap_xz": (0, 2)}
@@ -155,7 +155,7 @@ SURE_SIGMA = 5.0
 OUTLIER_MM = 0.1
 """Width of the range in which an outlier may lie."""
 LARGE_MM = 0.3
-"""Outliers are searched only in runs whose readings are all below this; larger deviations are no machine's."""
+"""Outliers are searched only in runs whose readings are all below this; no machine has larger deviations."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -168,7 +168,7 @@ class SuspectRun:
     cause : str
         Key of `FACTORS` or `SWAPS`: the run fits after this mistake is corrected. "other": no correction makes it fit.
     gain : float
-        By how much the log evidence of the campaign grows with this hypothesis.
+        Gain of the campaign's log evidence by this hypothesis.
     misfit_mm, expected_mm : float
         Rms difference between the run and the prediction of the other runs (its own set-up refitted), and its expected value.
     tied : tuple of str
@@ -187,7 +187,7 @@ class SuspectRun:
 class _Run:
     """A run as given, and with each possible mistake corrected.
 
-    ``first_setup``: index of the first set-up unknown; ``cleaned``: outliers against the other runs are already removed.
+    ``first_setup``: index of the first set-up unknown; ``cleaned``: outliers relative to the other runs are already removed.
     """
 
     label: str
@@ -239,7 +239,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 
 
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
-    """The run without readings that are outliers by the other runs; None without outliers or with too many."""
+    """The run without readings that are outliers relative to the other runs; None without outliers, or with too many."""
     part = run.as_is
     spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)
@@ -316,12 +316,12 @@ def _worst(runs: Sequence[_Run], limit: float) -> SuspectRun | None:
 
 
 def _least_misfit_mm(s: SuspectRun) -> float:
-    """A run that is as far from the others as expected is only noisy, whatever factor makes it quieter."""
+    """Return the least misfit, mm, that proves the cause: a run no farther from the others than expected is only noisy."""
     return max(GROSS * s.expected_mm, GROSS_MM) if s.cause == "other" else s.expected_mm
 
 
 def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
-    """A run with the mistake that explains the campaign best."""
+    """Return a run with the mistake that explains the campaign best."""
     others = together(rest)
     misfit, expected = _misfit(others, run)
     noisy = _noisier(run.as_is, max(1.0, misfit / expected))
@@ -333,7 +333,7 @@ def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
 
 
 def _noisier(part: Part, factor: float) -> Part:
-    """Return the run with this many times the usual noise: dividing a noisy run by 25.4 makes it quiet, too, but proves no wrong unit."""
+    """Return the run with this many times the usual noise: division by 25.4 makes any noisy run quiet and does not prove a wrong unit."""
     return Part(part.a / factor, part.y / factor, part.log_sigma + part.y.size * float(np.log(factor)))
 
 
@@ -353,7 +353,7 @@ def _swapped(run: RunData) -> dict[str, RunData]:
 
 
 def _misfit(others: Posterior, run: _Run) -> tuple[float, float]:
-    """Rms difference between a run, its own set-up refitted, and the prediction of the others, and its expected rms, mm."""
+    """Rms difference between a run (own set-up refitted) and the prediction of the others, and the expected value of this rms, mm."""
     part, first = run.as_is, run.first_setup
     r = part.y - part.a[:, :first] @ others.theta[:first]
     own = part.a[:, first:]

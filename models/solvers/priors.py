@@ -36,14 +36,14 @@ class Priors:
     ----------
     scale_rad, squareness_rad : linear positioning error per length; squareness.
     positioning_mm, straightness_mm : one Legendre coefficient of order 2 and more.
-    angle_rad, angle_slope_rad : one coefficient of order 2 and more; of order 1.
+    angle_rad, angle_slope_rad : one coefficient of an angle: of order 2 and more; of order 1.
     decay_order : coefficients fall with the order as 1 / (1 + (order / decay_order)^2), because machine errors are smooth.
-    rough_mm, rough_rad : rough part of a translation, of a rotation (orders above `SMOOTH_ORDER`): joints of rails, wear.
-    detail_mm : deviation at a place of a step test that no order follows, as of the lead of a screw (`abbe.models.solvers.details`).
+    rough_mm, rough_rad : rough part of a translation; rough part of a rotation (orders above `SMOOTH_ORDER`): joints of rails, wear.
+    detail_mm : deviation at a place of a step test that no order follows, e.g. from the lead of a screw (`abbe.models.solvers.details`).
     backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; error of a laser run's first record; drift of
         a laser run.
-    bar_length_mm, bar_unknown_mm : length of a bar that is called calibrated without a figure; of a bar that is not calibrated (set with a
-        gauge block or caliper; on a 150 mm bar this is too vague to determine a scale).
+    bar_length_mm, bar_unknown_mm : length of a bar that is stated as calibrated without a figure; length of an uncalibrated bar (set with a
+    gauge block or caliper; for a 150 mm bar too uncertain to determine a scale).
     laser_scale : relative error of the wavelength, common to all laser runs of a campaign.
     cosine : 1 / (m.l) - 1 of one laser set-up with mirror normal m and beam l, about u^2/2 - t.u for a beam off by u (0.3 mrad in each
         direction, 0.3 mm in 1 m) and a mirror tilted by t (``tilt_rad``): rms 0.25e-6, on 1 m as much as the noise of the reading.
@@ -113,18 +113,18 @@ MOTION_FACTOR = 2.5
 LARGEST_MOTION = 5.0
 """One error motion is never estimated more than this many times as large as its class, nor less than 1 / `LARGEST_SIZE` as large."""
 SMOOTHNESS_SD = 0.7
-"""Hyperprior of how much faster than documented the sizes of one motion fall with the order; never slower (`SizeModel.low`)."""
+"""Hyperprior: how much faster than documented the sizes of one motion may fall with the order; never slower (`SizeModel.low`)."""
 ORDER_SD, LEAST_ORDER, LARGEST_ORDER = 1.0, -6.0, 1.0
 """Hyperprior and bounds of the log variance of one order, common to all motions: a little larger than documented, or almost nothing."""
 LEARNED_SETUP = ("cup", "tilt", "cosine", "drift", "bar_drift", "detail", *LEARNED)
-"""Set-up unknowns from mounting and temperature, whose typical size is estimated from the data; that of calibrations is not."""
+"""Set-up unknowns whose typical size is estimated from the data: those from mounting and temperature, not those from calibrations."""
 LENGTHS = tuple(float(v) for v in np.round(0.1 * 2.0 ** (np.arange(16) / 4.0), 4))
 """Correlation lengths of the error motions that are tried, in strokes: 0.1 to 1.35."""
 FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
-"""How much the correlation lengths of one machine's motions differ: standard deviation of the logarithm, a factor of 1.5."""
+"""Spread of the correlation lengths of one machine's motions: standard deviation of the logarithm, a factor of 1.5."""
 ENDS_SHARES = (0.1, 0.03)
-"""Share of a motion's variance that is largest at the ends of the stroke, where guideways sag and screws bend most: usual, and least."""
+"""Share of a motion's variance that is largest at the ends of the stroke, where guideways sag and screws bend most: usual; least."""
 ROUGH_LENGTH_MM = 30.0
 """Correlation length of the rough part of a translational motion: between the pitch of a screw and the carriage's length."""
 SMALLEST_BEND = 0.003
@@ -149,7 +149,7 @@ def smooth_shapes(order: int, length: float, ends: float = ENDS_SHARES[0]) -> tu
     shapes : array, shape (order - 1, order - 1)
         Coefficients of every shape (columns), smoothest first, orthonormal.
     variance : array, shape (order - 1,)
-        Of every shape, for a process of variance 1 (before its straight line is removed).
+        Variance of every shape, for a process of variance 1 (before its straight line is removed).
     """
     spread = np.linspace(-2.0, 2.0, 9)
     share = np.exp(-0.5 * spread**2) / np.exp(-0.5 * spread**2).sum()
@@ -197,7 +197,7 @@ class SizeModel:
         Unknowns (in units of ``typical``) = ``root`` @ independent unknowns of reference variance 1; a block per error motion
         (`smooth_shapes`) and per rough part (`rough_root`), elsewhere the unit matrix.
     blocks, rough : tuple of arrays of int
-        Unknowns of each error motion of order 2 to `SMOOTH_ORDER`; of each rough part, the orders above.
+        Unknowns of each error motion of order 2 to `SMOOTH_ORDER`; unknowns of each rough part (higher orders).
     length, ends : float
         Correlation length of the error motions, strokes; share of their variance at the ends of the strokes.
     names : tuple of str
@@ -251,7 +251,7 @@ def size_model(machine: Machine, terms: tuple[Term, ...], rest: tuple[str, ...],
 
 
 MACHINE_SIZE = (2.0 * np.log(5.0), -2.0 * np.log(40.0), 2.0 * np.log(5.0))
-"""Hyperprior and bounds of the size of a whole machine (`Priors.pooled`): from small ones of 0.3 um to bad ones."""
+"""Hyperprior and bounds of the size of a whole machine's errors (`Priors.pooled`): from small ones of 0.3 um to those of a bad machine."""
 
 
 class _Number(NamedTuple):
@@ -263,7 +263,7 @@ class _Number(NamedTuple):
 
 
 def _classes(kinds: list[str]) -> list[_Number]:
-    """Size of every class. A set-up may be better than usual by any factor: its unknowns are not shapes, so a small size does no harm."""
+    """Size of every class. A set-up may be better than usual by any factor, because its unknowns are not shapes that could diverge."""
     high = 2.0 * np.log(LARGEST_SIZE)
     low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else 2.0 * np.log(SMALLEST_SIZE) for k in kinds}
     bounds = {k: (2.0 * np.log(SIZE_FACTOR), low[k], high) for k in kinds}

@@ -1,8 +1,8 @@
 """Roughness of a machine: the size of each motion's rough part, and periods such as the lead of a screw.
 
-A period is looked for in the residuals of a solution, one translational motion at a time. It is claimed only if it gains far more than the
-best of as many periods would by chance, and if no other period explains the readings about as well (readings at steps of one length cannot
-tell a period from its aliases).
+Periods are searched in the residuals of a solution, one translational motion at a time. A period is claimed only if its gain is far above
+that which the best of as many periods reaches by chance, and if no other period explains the readings about as well (readings at steps
+of one length cannot distinguish a period from its aliases).
 """
 
 from __future__ import annotations
@@ -21,11 +21,11 @@ from abbe.models.solvers.observe import run_design
 from abbe.models.solvers.priors import Priors
 
 SHORTEST_MM, LONGEST_MM = 4.0, 26.0
-"""Periods that are looked for: leads of screws. Longer ones can hardly be separated from the other roughness."""
+"""Range of the periods that are searched: leads of screws. Longer periods can hardly be separated from the other roughness."""
 LEAST_GAIN = 45.0
-"""Least gain in chi squared of a period (two more parameters): the best of 10,000 by chance reaches about 30."""
+"""Least gain in chi squared of a period (two more parameters); the best of 10,000 periods reaches about 30 by chance."""
 RIVAL = 0.5
-"""Another period that gains more than this share of the best one makes the best one ambiguous."""
+"""The best period is ambiguous if another period gains more than this share of its gain."""
 CHANCE = 30.0
 """Gain that the best of all periods reaches by chance."""
 MOST_PERIODS = 4
@@ -56,7 +56,7 @@ class Period:
 
 @dataclass(frozen=True, slots=True)
 class RoughMotion:
-    """Rough part of one translational motion: rms over the stroke with its standard uncertainty, and the shortest length it shows, mm."""
+    """Rough part of one translational motion: rms over the stroke with standard uncertainty, and the shortest length that it shows, mm."""
 
     motion: str
     rms_mm: float
@@ -134,7 +134,7 @@ class _Search:
 
     @classmethod
     def of(cls, solution: JointSolution) -> _Search:
-        """Fit the solution's unknowns again, in units of their prior, with the readings that looked like outliers because of a period."""
+        """Fit the solution's unknowns again, in units of their prior, with the readings that became outliers because of a period."""
         root_weight = np.sqrt(np.concatenate(_weights(solution)))
         own = np.concatenate([run_design(solution.machine, solution.terms, r, solution.setup) for r in solution.data])
         columns = root_weight[:, None] * (own @ solution.prior_root)
@@ -146,7 +146,7 @@ class _Search:
         return cls(solution, rest - columns @ change, root_weight, columns, np.asarray(covariance, dtype=np.float64), half)
 
     def best(self, rest: F1) -> tuple[Period, F1] | None:
-        """The clearest period of all motions, and what it explains of ``rest``; None if none is clear."""
+        """The clearest period of all motions, and the part of ``rest`` that it explains; None if no period is clear."""
         tried = [(name, a, c) for a, axis in enumerate(AXES) for c, name in enumerate(motion_names(axis)[:3])]
         found = [(*self._scan(rest, a, c), name, a, c) for name, a, c in tried]
         gain, frequency, alone, name, axis, component = max(found, key=lambda f: f[0])
@@ -190,7 +190,7 @@ class _Search:
         return Period(name, amplitude, u_amplitude, 1.0 / float(at), u / float(at) ** 2), explained
 
     def _rival(self, rest: F1, axis: int, component: int, frequency: float) -> float:
-        """Largest gain of any other frequency, with everything else that the solution has refitted."""
+        """Largest gain of any other frequency, with all unknowns of the solution refitted."""
         length = float(self.solution.machine.length_mm[axis])
         other = np.arange(1.0 / LONGEST_MM, 1.0 / SHORTEST_MM, 0.4 / length)
         other = other[np.abs(other - frequency) > 2.0 / length]
@@ -204,7 +204,7 @@ class _Search:
         return float(gain.max(initial=0.0))
 
     def _exact(self, rest: F1, axis: int, component: int, frequency: float) -> tuple[float, F1, float, float]:
-        """Gain with everything else that the solution has refitted, the readings explained, amplitude and its standard uncertainty."""
+        """Gain with all unknowns of the solution refitted, the readings explained, amplitude and its standard uncertainty."""
         wave = np.column_stack(self._waves(axis, component, np.array([frequency])))
         across = wave.T @ self.columns
         information = wave.T @ wave - across @ self.covariance @ across.T
@@ -218,7 +218,7 @@ class _Search:
 
 
 def _gain(rest: F1, cosine: F2, sine: F2) -> F1:
-    """Gain in chi squared of a wave of each frequency, nothing else refitted."""
+    """Gain in chi squared of a wave of each frequency, without refit of the other unknowns."""
     c, s = rest @ cosine, rest @ sine
     cc, ss, cs = (cosine**2).sum(0), (sine**2).sum(0), (cosine * sine).sum(0)
     return np.asarray((ss * c**2 - 2.0 * cs * c * s + cc * s**2) / np.maximum(cc * ss - cs**2, 1e-6 * cc * ss + 1e-9))

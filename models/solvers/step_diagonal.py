@@ -165,8 +165,8 @@ def u_wang_four(inc_mm: F1, n: int, u_reading_mm: float, u_scale: float = 0.0) -
 def demeaned(q: dict[str, F2]) -> dict[str, F2]:
     """Step readings less the mean of each series (axis and diagonal): Wang's remedy for mirror tilt (IV.C).
 
-    It removes the tilt and with it all twelve slopes: the result of `wang_eq7` then has no scale and no squareness, which the paper does
-    not say. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
+    This removes the tilt and with it all twelve slopes: the result of `wang_eq7` then has no scale and no squareness. The paper does not
+    say so. ``q`` and the result: dict of arrays (3 axes, n), mm, normalised by `increments`.
     """
     return {name: np.asarray(values - values.mean(axis=1, keepdims=True)) for name, values in q.items()}
 
@@ -174,7 +174,7 @@ def demeaned(q: dict[str, F2]) -> dict[str, F2]:
 def closure_mm(q: dict[str, F2]) -> F2:
     """Closure ppp - npp - pnp - ppn per axis and interval, from the redundant fourth diagonal; not in the paper.
 
-    It is zero for pure translations and shows mirror tilt; of angular errors it shows only the effect of one step.
+    The closure is zero for pure translations and shows mirror tilt; of angular errors it shows only the effect of one step.
 
     Parameters
     ----------

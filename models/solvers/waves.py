@@ -1,9 +1,9 @@
 """Search for periods of screws in points of artefacts: one period or two at once, on one axis or on all.
 
-The data are the displacements at the positions of the axes, with everything else that the solution has integrated out. Every period is
-judged by the evidence of a sine and a cosine beside a scatter from position to position, whose size is integrated out as well. Two periods
-are searched together: while one is looked for alone the other one is scatter, and an alias may fit best, because features stand at
-multiples of a pitch. The result is a probability for every frequency.
+The data are the displacements at the positions of the axes, with all other unknowns of the solution integrated out. Every period is
+judged by the evidence of a sine and a cosine plus a scatter from position to position, whose size is integrated out as well. Two periods
+are searched together: in a search for one alone, the other is scatter, and an alias may fit best, because features stand at multiples of
+a pitch. The result is a probability for every frequency.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ the same one. One period has the weight (1 - `TWO`) (1 - `SMOOTH`), two have `TW
 LEAST = 0.05
 """Least probability of a period that enters the model."""
 COARSE, FINE, NEAR = 0.3, 0.06, 2
-"""Steps of the searched frequencies times the length of the positions: of pairs, and of the neighbourhood of the best pairs, with its half
-width in fine steps."""
+"""Steps of the searched frequencies times the length of the positions: `COARSE` for pairs, `FINE` near the best pairs; `NEAR`: half width
+of their neighbourhood in fine steps."""
 APART = 4
-"""Coarse steps between the two periods of a pair, at least: closer ones are one period with a changing amplitude."""
+"""Least number of coarse steps between the two periods of a pair: closer periods are one period with a changing amplitude."""
 LIKELY, MOST = 60, 700
 """`LIKELY`: number of pairs whose neighbourhood is searched finely. `MOST`: largest number of coarse frequencies from which pairs are
 formed, those that are best alone.
@@ -90,7 +90,7 @@ class Displacements:
         return np.concatenate([pair * (self.axis == a)[:, None] for a in axes], axis=-1)
 
     def beside(self, scatter_mm: float) -> tuple[F1, F2, float]:
-        """The same likelihood with an independent scatter of every displacement integrated out, and its log evidence."""
+        """The likelihood after an independent scatter of every displacement is integrated out, and its log evidence."""
         whole = np.eye(self.h.size) + scatter_mm**2 * self.information
         h, information = np.linalg.solve(whole, self.h), np.linalg.solve(whole, self.information)
         evidence = 0.5 * scatter_mm**2 * self.h @ h - 0.5 * np.linalg.slogdet(whole)[1]
@@ -146,7 +146,7 @@ def _evidence(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tup
 def _pairs(
     data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequency: F1, log_prior: F1, single: F1
 ) -> Pair:
-    """Pairs of frequencies around the best ones of a coarse search that takes the axes for independent, each once."""
+    """Pairs of frequencies near the best pairs of a coarse search, in which the axes are taken as independent; each pair once."""
     step = round(COARSE / FINE)
     coarse = np.arange(0, frequency.size, step)
     coarse = np.sort(coarse[np.argsort(-single[coarse])[:MOST]])
@@ -161,7 +161,7 @@ def _pairs(
 
 
 def _gain_of_pairs(waves: NDArray[np.float64], h: F1, information: F2) -> F2:
-    """Log evidence of every pair of frequencies on one axis beside that of none, shape (frequencies, frequencies); waves (f, n, 2)."""
+    """Log evidence of every pair of frequencies on one axis minus that of none, shape (frequencies, frequencies); waves (f, n, 2)."""
     f = len(waves)
     flat = waves.transpose(1, 0, 2).reshape(h.size, -1)
     asked, across = (flat.T @ h).reshape(f, 2), (flat.T @ information @ flat).reshape(f, 2, f, 2).transpose(0, 2, 1, 3)

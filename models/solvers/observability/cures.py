@@ -1,6 +1,6 @@
 """Cures for hidden combinations: measurements or certificates that would show them.
 
-Every usual addition is tried: the rank with it is computed for the campaign at hand, so the advice fits this machine and these runs.
+Every usual addition is tried: the rank with the addition is computed for this campaign, so the advice fits this machine and these runs.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ SHORTEST_BAR_MM = 10.0
 MARGIN = 0.1
 """Fraction of the stroke between virtual runs and its ends."""
 SHOWN = 1e-7
-"""Least effect on an addition's readings (unit columns) for a hidden combination to count as shown; hidden means below 1e-9."""
+"""A hidden combination counts as shown from this effect on an addition's readings (unit columns) on; hidden means below 1e-9."""
 
 
 @dataclass(frozen=True)
@@ -119,7 +119,7 @@ def place_text(axis: int, place_mm: F1) -> str:
 def free_corner(machine: Machine, axis: int, inner: np.ndarray[tuple[int, ...], np.dtype[np.float64]], places: tuple[F1, ...]) -> F1:
     """The edge of the inner volume (3, 2) along an axis that is farthest from the lines at ``places``; the lowest without lines.
 
-    It is returned as the edge's lower end, mm.
+    The result is the edge's lower end, mm.
     """
     others = [k for k in range(3) if k != axis]
     corners = []
@@ -297,7 +297,7 @@ def _helices(machine: Machine, runs: tuple[RunData, ...]) -> tuple[RunData, ...]
 
 
 def _other_tools(machine: Machine, runs: tuple[RunData, ...]) -> tuple[F1, F1]:
-    """A tool longer than those of the runs, and one whose end is off to the side, vectors in mm."""
+    """A tool longer than those of the runs, and a tool whose end has a lateral offset, vectors in mm."""
     tools = [with_tool(machine, r.tool_mm).tool_mm for r in runs]
     tool = max(tools, key=lambda t: float(np.linalg.norm(t)))
     along = tool / np.linalg.norm(tool) if tool.any() else np.array([0.0, 0.0, -1.0])
@@ -337,7 +337,7 @@ class CureTrial:
     observed: F2
 
     def shows(self, combinations: F2) -> int:
-        """Number of these hidden combinations that the addition makes visible; columns (k, m) of orthonormal coordinates."""
+        """Number of the hidden combinations that the addition makes visible, given as columns (k, m) of orthonormal coordinates."""
         return count_observed(self.observed @ combinations)
 
 
@@ -358,7 +358,7 @@ def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[Cure
 
 
 def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, int]]:
-    """Choose additions one by one, each showing most of what is still hidden; with the number of combinations shown after each."""
+    """Choose additions one by one, each showing most of the combinations still hidden; return them with the number shown after each."""
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
     while left and shown < hidden:
@@ -394,7 +394,7 @@ def _shown(campaign: CampaignLayout, addition: Addition, hidden: Play) -> F2:
 
 
 def _known_with(campaign: CampaignLayout, runs: tuple[RunData, ...], setup: SetupUnknowns, new: CampaignColumns) -> Knowledge:
-    """Knowledge with the addition's set-up unknowns, by the rules of `stated_knowledge`; that of the campaign stays."""
+    """Return the campaign's knowledge, extended to the addition's set-up unknowns by the rules of `stated_knowledge`."""
     known, before = campaign.known, set(campaign.columns.setup_names)
     stated = stated_knowledge(campaign.terms, runs, setup.names).fixed
     fixed = {n: v for n, v in stated.items() if n not in before} | {n: v for n, v in known.fixed.items() if n in new.setup_names}

@@ -21,7 +21,7 @@ LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
 """Largest sets of motions that are searched for hidden combinations: with all orders, and with orders up to LOW, which are tried first (the
 slope of an angle times the travel of its own axis is of order 2). All other hidden combinations are reported as mixtures."""
 INSIDE = 1e-9
-"""A set of motions contains a hidden combination if an eigenvalue of its block of the null space's projector is within this of 1."""
+"""A set of motions contains a hidden combination if its block of the null space's projector has an eigenvalue within this of 1."""
 ENTRY = 1e-6
 """Entries of a unit vector below this are rounding."""
 NEW = 1e-4
@@ -58,7 +58,7 @@ def motion_text(motion: str) -> str:
 
 
 def part_text(motion: str, orders: Iterable[int]) -> str:
-    """Text for the part of a motion: its slope (order 1, for positioning the scale), its shape (order 2 and more), or all of it."""
+    """Text for a part of a motion: its slope (order 1; for positioning the scale), its shape (order 2 and more), or the whole motion."""
     found, whole = sorted(set(orders)), motion_text(motion)
     if found == [0] or not found:
         return whole
@@ -71,7 +71,7 @@ def part_text(motion: str, orders: Iterable[int]) -> str:
 
 
 def sentence(terms: tuple[Term, ...], family: Family, ending: str = "") -> str:
-    """Sentence about the motions that cannot be distinguished, with their ratio where it is one number."""
+    """Sentence about the motions that cannot be distinguished, with their ratio if this is one number."""
     parts = [part_text(m, _orders(terms, family, m)) for m in family.motions]
     if len(parts) == 1:
         return f"{_upper(parts[0])} leaves no trace{ending}"
@@ -166,7 +166,7 @@ def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], fa
 
 
 def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tuple[str, ...], int]]:
-    """Sets of ``size`` motions that contain hidden combinations, and how many: eigenvalues 1 of their block of the projector."""
+    """Sets of ``size`` motions that contain hidden combinations, and how many: the eigenvalues 1 of a set's block of the projector."""
     sets = list(combinations(rows, size))
     if not sets:
         return []
@@ -223,7 +223,7 @@ def _family(terms: tuple[Term, ...], vectors: F2, factor: F1, *, exact: bool) ->
 
 
 HARMLESS = 1e-7
-"""Deviation (unit columns, relative to the largest) below which a combination moves the tool nowhere."""
+"""Deviation (unit columns, relative to the largest) below which a combination does not move the tool anywhere."""
 CURES = 3
 TOOLS = ("tool", "aside")
 
@@ -242,9 +242,9 @@ class HiddenGroup:
     vectors : array, shape (p, count)
         All combinations, coefficients in their own units.
     harmless : bool
-        Whether the combinations move none of the tools used anywhere in the volume (they would move another tool).
+        Whether the combinations do not move any tool used, anywhere in the volume (they would move another tool).
     effect_mm : float
-        Rms deviation that a typical machine may hide here, at the worst point, rigid motion removed, mm; 0 if harmless.
+        Rms deviation, at the worst point, that these combinations hide on a typical machine, rigid motion removed, mm; 0 if harmless.
     cause, cures, text
         Cause; additions each of which would show all combinations; sentences for the report.
     """
@@ -310,7 +310,7 @@ def _fields(campaign: CampaignLayout, factor: F1) -> F2:
 def _lines(machine: Machine, nodes: int) -> F2:
     """Points on nine lines along each axis of the inner volume.
 
-    They determine as much as a whole grid: an error motion depends on one axis, and its lever linearly on the others.
+    These points determine as much as a whole grid: an error motion depends on one axis, and its lever linearly on the others.
     """
     box = inner_box(machine)
     three = np.stack([box[:, 0], box.mean(axis=1), box[:, 1]], axis=1)
@@ -322,7 +322,7 @@ def _lines(machine: Machine, nodes: int) -> F2:
 
 
 def _silent(null_space: F2, field: F2) -> F2:
-    """Hidden combinations that move none of the tools anywhere in the volume, orthonormal in unit columns, shape (p, m)."""
+    """Hidden combinations that do not move any of the tools in the volume, orthonormal in unit columns, shape (p, m)."""
     if not null_space.shape[1]:
         return null_space
     _, s, vt = svd(field @ null_space, full_matrices=True)

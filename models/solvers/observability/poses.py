@@ -1,7 +1,7 @@
-"""Errors of a plane that the poses of a probed artefact show, errors that these poses hide, and a further pose that would show those.
+"""Errors of a plane that the poses of a probed artefact show, errors that they hide, and a further pose that would show the hidden ones.
 
 The form of the artefact is unknown. So only errors of the machine that move relative to the artefact become visible. The analysis is of
-first order. Its unknowns: fields of the machine in the plane up to degree 4 (27 beside rigid motions), one pose per run, and the form;
+first order. Its unknowns: fields of the machine in the plane up to degree 4 (27 without rigid motions), one pose per run, and the form;
 without a calibrated length also the artefact's scale. Source: artefact-based self-calibration (reversal, rotation, translation), Evans,
 Hocken and Estler 1996.
 """
@@ -20,16 +20,16 @@ from abbe.models.solvers.observations import RunData
 
 DEGREE = 4
 HIDDEN, TOLERANCE = 0.02, 1e-3
-"""`HIDDEN`: a field is hidden if form and poses can explain all but a smaller share of it. `TOLERANCE`: least singular value that counts,
-as a share of the largest: poses that differ by a millimetre only on paper give no information about micrometres."""
+"""`HIDDEN`: a field is hidden if the share of it that form and poses cannot explain is smaller. `TOLERANCE`: least singular value that
+counts, as a share of the largest: poses that differ by only a millimetre give no information about micrometres."""
 FLAT = 1e-3
 SHIFT = 0.37
-"""Proposed shift as a share of a pitch: no simple fraction, so that it also shifts against the lead of a screw."""
+"""Proposed shift as a share of a pitch; not a simple fraction, so that the shift is none of the screw's lead either."""
 
 
 @dataclass(frozen=True)
 class PoseRank:
-    """``rank`` of the ``of`` fields beside rigid motions; ``hidden``: named fields that leave no trace; ``cures``: further poses with the
+    """``rank`` of the ``of`` fields without rigid motions; ``hidden``: named fields that leave no trace; ``cures``: further poses with the
     rank that they would give and errors that they would show."""
 
     plane: str
@@ -101,7 +101,7 @@ def stated_places(axes_mm: F2, matrix: F2, nominal_mm: F2, keep: list[int]) -> F
 
 
 def _rank_and_hidden(poses: list[_Pose], *, scale: bool) -> tuple[int, tuple[str, ...]]:
-    """Rank of the fields beside rigid motions, and the named fields that are hidden."""
+    """Rank of the fields without rigid motions, and the named fields that are hidden."""
     every = np.concatenate([p.at for p in poses])
     middle, reach = 0.5 * (every.min(axis=0) + every.max(axis=0)), float(np.ptp(every, axis=0).max()) / 2.0
     fields = np.concatenate([_rows(p, _fields((p.at - middle) / reach)) for p in poses])

@@ -32,13 +32,13 @@ BAR_TRAVEL_MM = 1.0
 """Measuring range of a usual ball-bar to either side of its nominal length."""
 HAND_SET = ("cup", "tilt", "zero", "pose", "turn", "form", "scale", "stylus", "lobing")
 """Set-up unknowns that no run states; together with uncalibrated bar lengths they are free in every rank analysis.
-All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). They are known for the
-rank and count in every uncertainty. Otherwise a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in time,
-like the height of a helix) a squareness."""
+All others have a stated limit: slow drifts, the laser's wavelength, its cosine error (`abbe.models.solvers.priors`). These count as known
+for the rank and add to every uncertainty. Otherwise a wavelength good to 0.3e-6 would hide every scale, and a drift of the cup (linear in
+time, like the height of a helix) would hide a squareness."""
 ROUNDING = 1e-6
 """Columns shorter than this fraction of the longest one count as zero. The longest columns are levers of about 1000 mm, so such a column is
-a lever of 1 um or a direction cosine of 0.001, from rounded positions, tools and pivots. Through it a motion of typical size (20 urad,
-5 um) moves no reading by more than 5 nm. Columns of observed motions are longer than 1e-4 of the longest."""
+a lever of 1 um or a direction cosine of 0.001, from rounded positions, tools and pivots. By such a column a motion of typical size
+(20 urad, 5 um) changes a reading by at most 5 nm. Columns of observed motions are longer than 1e-4 of the longest."""
 NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
 Status = Literal["observed", "weak", "not observable"]
@@ -50,7 +50,7 @@ NODES = 41
 
 
 def as_meant(run: RunData) -> RunData:
-    """Remove rounding from the positions of a run, so that it does not count in the rank.
+    """Remove rounding from the positions of a run, so that rounding does not count in the rank.
 
     A nearly straight path (`STRAIGHT_MM`) becomes straight and lies along its beam (`NEAR_BEAM`); an axis that hardly moves is at rest;
     step diagonals stay as they are. Positions of a ball-bar run move onto the sphere of the nominal length, from which rounding, chords and
@@ -94,10 +94,10 @@ class Knowledge:
     Attributes
     ----------
     fixed : mapping of set-up unknown to array, shape (number of terms,)
-        Known set-up errors: zero, or this combination of the machine's own errors (a mirror that was squared to the machine's Z line has
-        the tilt of that line).
+        Known set-up errors: zero, or this combination of the machine's errors (a mirror squared to the machine's Z line has the tilt of
+        that line).
     shared : tuple of tuples of names
-        Groups of unknowns that are the same, e.g. the lengths of one sensor with two calibrated extension bars.
+        Groups of unknowns that are equal, e.g. the lengths of one sensor with two calibrated extension bars.
     lost_motion : bool
         Whether the machine may have lost motion. The papers' models have none.
     """
@@ -165,8 +165,8 @@ def compressed(columns: CampaignColumns) -> CampaignColumns:
 def stated_knowledge(terms: tuple[Term, ...], runs: tuple[RunData, ...], setup_names: tuple[str, ...]) -> Knowledge:
     """Set-up unknowns that count as known: lengths of calibrated bars, and all others except those of `HAND_SET`.
 
-    A bar counts as calibrated if every run with it says so or states its uncertainty, and none says the opposite
-    (`abbe.models.solvers.priors.bar_length_sd`); how well it was calibrated enters the uncertainties, not the rank. Cup offsets, mirror
+    A bar counts as calibrated if every run with it says so or states its uncertainty, and no run says the opposite
+    (`abbe.models.solvers.priors.bar_length_sd`). The calibration's uncertainty affects the uncertainties, not the rank. Cup offsets, mirror
     tilts, laser zeros and uncalibrated lengths are free, however narrow their priors are.
     """
     vague = {bar_length_name(r.radius_mm) for r in runs if r.radius_mm is not None and not _calibrated(r)}
@@ -222,7 +222,7 @@ def observed_information(columns: CampaignColumns, known: Knowledge) -> Observed
 
 
 def _without_rounding(a: F2) -> F2:
-    """The design with columns of mere rounding (`ROUNDING`) set to zero; scaled to unit length they would count as observed."""
+    """The design with columns of mere rounding (`ROUNDING`) set to zero; scaled to unit length, such columns would count as observed."""
     norm = np.linalg.norm(a, axis=0)
     return np.where(norm > ROUNDING * norm.max(initial=0.0), a, 0.0)
 
@@ -240,7 +240,7 @@ class Play:
     loose : array, shape (q, m)
         Changes of free unknowns alone that leave no trace, own units.
     size : array, shape (q, 1)
-        Value of each free unknown that equals one in unit columns.
+        Value of each free unknown that corresponds to 1 in unit columns.
     """
 
     groups: tuple[tuple[str, ...], ...]
@@ -359,7 +359,7 @@ def motions(machine: Machine, terms: tuple[Term, ...], covariance: F2, prior: F2
     Parameters
     ----------
     covariance, prior : array, shape (p, p)
-        Of the terms' coefficients, after and before the runs.
+        Covariance of the terms' coefficients after the runs, and before them.
     hidden : names of the coefficients that take part in hidden combinations.
     """
     nodes = np.stack([np.linspace(lo, hi, NODES) for lo, hi in machine.stroke_mm], axis=1)
@@ -387,8 +387,7 @@ def _reason(hidden: tuple[str, ...], share: float, status: Status) -> str:
 def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -> tuple[str, ...]:
     """Names of the error motions that may be written into tables of their own, because they rest on readings.
 
-    None of such a motion's coefficients is in a hidden combination, and at least 90 % of its information comes from the readings (with
-    ``weak``: 10 %). Other motions may still be corrected where only the sum of all motions counts: in a grid of the volume for the measured
-    tool.
+    Such a motion has no coefficient in a hidden combination, and at least 90 % of its information comes from the readings (with ``weak``:
+    10 %). Other motions may still be corrected where only the sum of all motions counts: in a grid of the volume for the measured tool.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))

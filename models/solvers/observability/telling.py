@@ -20,7 +20,7 @@ ROUNDING = 1e-9
 def run_sensitivity(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...]) -> tuple[tuple[str, ...], F2]:
     """Rms change of the readings of each run per unit rms of each motion over its stroke, mean over the motion's shapes.
 
-    The part that unknowns of the set-up (cup, bar, mirror, drift) absorb is removed, the part that other motions could explain is not.
+    The part that unknowns of the set-up (cup, bar, mirror, drift) absorb is removed; the part that other motions could explain stays.
 
     Returns
     -------

@@ -29,8 +29,8 @@ USABLE, GOOD = 3.0, 10.0
 class Knowing:
     """Covariances of the error motions' coefficients in their own units, shape (p, p).
 
-    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that comes from reading noise,
-    divided by the mean square of that noise, mm^2.
+    ``prior``: that of a typical machine; ``posterior``: that after the runs; ``noise``: the part of the posterior that comes from reading
+    noise, divided by the mean square of that noise, mm^2.
     """
 
     prior: F2
@@ -46,8 +46,8 @@ class Volume:
     ----------
     axes_mm : array, shape (n, 3)
     prior_mm, u_mm : array, shape (n,)
-        Rms length of a typical machine's deviation; of the difference between truth and prediction (root sum of squares of the components'
-        standard uncertainties).
+        Rms length of a typical machine's deviation; rms length of the difference between truth and prediction (root sum of squares of the
+        components' standard uncertainties).
     worst_mm : array, shape (n,)
         Standard uncertainty in the direction in which it is largest.
     gain : array, shape (n,)
@@ -119,7 +119,7 @@ def frame_free_design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2, re
 
 
 def _rigid_about(points_mm: F2, centre_mm: F1) -> F3:
-    """As `abbe.models.geometry.volume.rigid_design`, about a given centre instead of the mean of the points."""
+    """Do the same as `abbe.models.geometry.volume.rigid_design`, about a given centre instead of the mean of the points."""
     out = np.zeros((points_mm.shape[0], 3, 6))
     out[:, :, :3] = np.eye(3)
     for k in range(3):
@@ -171,11 +171,11 @@ def _length(covariance: F3) -> F1:
 def observability_number(volume: Volume) -> Number:
     """Factor by which a correction from these runs can at best reduce the largest error of a typical machine.
 
-    It is the largest prior size over the largest remaining uncertainty in the inner 80 %, both without rigid motion. (A ratio at each point
-    would be lowest in the middle of the volume, where the fitted rigid motion leaves little error.) At 10, a machine with 30 um of
+    It is the largest prior size divided by the largest remaining uncertainty in the inner 80 %, both without rigid motion. (A ratio at each
+    point would be lowest in the middle of the volume, where the fitted rigid motion leaves little error.) At 10, a machine with 30 um of
     volumetric error can be brought to 3 um at best; without runs the number is 1. Below 3, more than a tenth of a typical machine's
-    variance (1/3^2) stays unknown: a correction would be mostly assumption. From 10 on, at most a hundredth does, and repeatability and
-    temperature dominate. The number does not include errors above the model's order and changes with time.
+    variance (1/3^2) stays unknown: a correction would be mostly assumption. From 10 on, at most a hundredth stays unknown, and
+    repeatability and temperature dominate. The number does not include errors above the model's order and changes with time.
     """
     prior, u = volume.prior_mm[volume.inner], np.maximum(volume.u_mm[volume.inner], 1e-12)
     k = int(np.argmax(u))
