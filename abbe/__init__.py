@@ -1,4 +1,4 @@
-"""Abbe: how a 3-axis machine really moves, and its correction.
+"""Abbe determines how a 3-axis machine really moves, and corrects it.
 
 This is the public interface (decision 0035): the names below are documented and stable; everything else is private. Lengths are in mm,
 angles in rad, times in s, unless a name says otherwise. The subpackages are links to the folders beside this one (decision 0031).

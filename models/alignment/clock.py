@@ -31,7 +31,7 @@ SURE = 10.0
 """Smallest step that is detected, as a multiple of the scatter of the blocks' smallest delays."""
 LEAST_STEP_S = 1e-3
 SIDE = 4
-"""Minimum number of blocks on either side of a step; fewer late blocks at the beginning or the end are a spike of the delays."""
+"""Minimum number of blocks on either side of a step; fewer late blocks at the beginning or end are a spike of the delays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,7 +67,7 @@ MANY_DELAYS = Constants(
 class Envelope:
     """Line ``level + slope (x - middle)`` under a cloud of points, corrected for its bias, with standard uncertainties.
 
-    ``span``: from the first to the last x. ``lowest``: indices of the two points on which the line rests.
+    ``span``: distance from the first to the last x. ``lowest``: indices of the two points on which the line rests.
     """
 
     middle: float
@@ -152,8 +152,8 @@ class ClockFit:
     """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, without the shortest delay.
 
     ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time in this middle, ``u_rate`` of
-    the rate, ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number left
-    out because they came impossibly early.
+    the rate, ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number of
+    arrivals left out because they came impossibly early.
     """
 
     device_s0: float
@@ -270,7 +270,7 @@ class Break:
 def breaks(device_s: F1, arrived_s: F1) -> tuple[Break, ...]:
     """Find all breaks of a device's clock, in order.
 
-    At a restart, device time falls. At a step, the smallest delays jump to another level and stay there; after a mere spike they return.
+    At a restart, device time falls. At a step, the smallest delays jump to another level and stay there; after a spike they return.
     """
     x, y = np.asarray(device_s, dtype=np.float64), np.asarray(arrived_s, dtype=np.float64)
     falls = np.flatnonzero(np.diff(x) < 0.0) + 1
@@ -320,7 +320,7 @@ def _lowest(x: F1, y: F1) -> int:
 
 
 def _best_split(x: F1, y: F1) -> _Split:
-    """Find the best split into two levels with a common slope; it uses medians, which ignore a block in which all arrivals are late."""
+    """Find the best split into two levels with a common slope, by medians, which ignore a block in which all arrivals are late."""
     best, least = _Split(0, 0.0, 0.0, 1.0, 0.0), np.inf
     first, second = np.triu_indices(x.size, 1)
     slopes = (y[second] - y[first]) / (x[second] - x[first])

@@ -13,14 +13,14 @@ import numpy as np
 from abbe.models.arrays import F1
 
 GAP = 7.0
-"""Cost of a place or a standstill without a partner: minus the logarithm of its probability, which is one in a thousand."""
+"""Cost of a place without a standstill, or a standstill without a place: minus the logarithm of its probability, one in a thousand."""
 SURE = 3.0
 """An assignment that costs at most this much more than the best one counts as equally good."""
 NEAR, LARGEST_MM = 0.75, 2.0
-"""Largest change of the deviation from one place to the next: a share of the distance to the nearest other place that may be approached
-from the same side, but at most a constant."""
+"""Largest change of the deviation from one place to the next: the share `NEAR` of the distance to the nearest other place that may be
+approached from the same side, but at most `LARGEST_MM`."""
 SAME = 0.25
-"""Two standstills are at one place if they differ by less than this share of that largest change."""
+"""Two standstills are at one place if they differ by less than this share of the largest change (`NEAR`, `LARGEST_MM`)."""
 BASE_MM, PER_MM, TURN_MM = 1e-3, 3e-5, 1e-2
 """Usual change of the deviation from place to place: a constant, a part per mm of distance, and a part if the side of approach changes."""
 ZERO_MM, ZERO_PER_MM = 2e-2, 5e-5
@@ -33,7 +33,7 @@ I1 = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 class Match:
     """An assignment: ``pairs`` maps the index of a place to that of its standstill; ``cost`` is minus the logarithm of its probability.
 
-    ``rival``: if another assignment is equally good, a standstill and two places to which it may belong.
+    ``rival``: a standstill and two places to which it may belong, if another assignment is equally good.
     """
 
     cost: float
@@ -52,7 +52,7 @@ class _Candidates:
 
 
 def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: float, zeroed: bool, rivals: bool = True) -> Match:
-    """Find the cheapest assignment of standstills to places that keeps their order.
+    """Find the assignment of standstills to places that keeps their order at the lowest cost.
 
     Parameters
     ----------
@@ -92,7 +92,7 @@ def match(levels: F1, levels_side: F1, targets: F1, *, offset: float, noise: flo
 
 
 def places_reach(targets: F1, sides: F1) -> F1:
-    """Return by how much the deviation may change at most from the previous place to each place, mm, shape (n,)."""
+    """Return the largest allowed change of the deviation from the previous place to each place, mm, shape (n,)."""
     away = np.abs(targets[:, None] - targets[None, :])
     other = (away > 1e-6) & ((sides[:, None] * sides[None, :]) >= 0.0)
     nearest = np.where(other, away, np.inf).min(axis=1)
@@ -271,7 +271,7 @@ class DwellReading:
 
 @dataclass(frozen=True, slots=True)
 class Dwells:
-    """Result of `detect`. ``readings``: in the order of the plan, None if the standstill is missing.
+    """Result of `detect`. ``readings``: one per planned standstill, in the order of the plan; None if the standstill is missing.
 
     ``missing``: indices of the planned standstills not found. ``extra``: unplanned standstills, each with the index of the planned one
     before it (-1: none). ``odd``: indices of standstills much longer or shorter than planned. ``noise``: standard deviation of one sample.
@@ -298,8 +298,8 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     settle_s : float
         First part of each standstill, in which the axes settle and no readings are taken.
     zero : float, optional
-        Reading of the instrument at target 0, if it was zeroed there. Without it the match determines the offset between plan and stream,
-        and is refused if two offsets explain the stream equally well.
+        Reading of the instrument at target 0, if it was zeroed there. Otherwise the match determines the offset between plan and stream; a
+        match is refused if two offsets explain the stream equally well.
     step : float
         Smallest step of the readings; the uncertainty of a mean contains it (GUM F.2.2.1), because samples at rest share their rounding.
 
@@ -357,7 +357,7 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
     """Return whether the standstill of place ``k`` may also be that of the previous or next pass over the same target.
 
-    This is so if only one turning point lies between both passes, and neither it nor the other pass has a standstill.
+    The answer is yes if only one turning point lies between both passes, and neither this point nor the other pass has a standstill.
     """
     if k in (0, targets.size - 1):
         return False
@@ -403,7 +403,8 @@ def _extra(found: tuple[Standstill, ...], pairs: dict[int, int]) -> tuple[tuple[
 def _matched(found: tuple[Standstill, ...], side: F1, targets: F1, zero: float | None, noise: float) -> dict[int, int]:
     """Map the index of each place to that of its standstill; ValueError if two assignments are equally good.
 
-    Without ``zero``, try all offsets that pair one of the first standstills with one of the first targets, or of the last ones.
+    Without ``zero``, try all offsets that pair one of the first standstills with one of the first targets, or one of the last with one of
+    the last.
     """
     levels = np.array([s.level for s in found])
     if levels.size == 0:
@@ -438,7 +439,7 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
 
 
 def _shifted(one: dict[int, int], other: dict[int, int]) -> bool:
-    """Return whether two matches assign most of the standstills that both contain to different places."""
+    """Return whether two matches assign most of their common standstills to different places."""
     first, second = ({s: k for k, s in pairs.items()} for pairs in (one, other))
     both = first.keys() & second.keys()
     return 2 * sum(first[s] != second[s] for s in both) > len(both)
@@ -483,7 +484,7 @@ def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
 
 
 def merged(planned: list[PlannedDwell]) -> tuple[PlannedDwell, ...]:
-    """Merge neighbours with the same target into one standstill with the readings and the time of both."""
+    """Merge neighbours with the same target into one standstill with the readings and the time of all."""
     out: list[PlannedDwell] = []
     for one in planned:
         if out and abs(out[-1].target - one.target) < 1e-6:

@@ -85,7 +85,7 @@ def _newey_west(score: F1) -> float:
 
 
 def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, search_s: float = 0.5, smooth_s: float = 2.0) -> Lag:
-    """Fit the lag of readings taken out and back along one path at one speed: the two patterns are shifted by twice the lag.
+    """Fit the lag of readings taken out and back along one path at one speed, which shifts the two patterns by twice the lag.
 
     Parameters
     ----------
@@ -94,10 +94,10 @@ def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, s
     out, back : array, shape (n,)
         Readings on the way out, and on the way back at the same positions.
     columns : array, shape (n, k), optional
-        Other differences between the two ways, e.g. lost motion (direction of the bar times the change of sign of each axis). A constant
-        is always included.
+        Other differences between the way out and the way back, e.g. lost motion (direction of the bar times the change of sign of each
+        axis). A constant is always included.
     search_s : float
-        The lag counts as determined if its uncertainty is below half of this.
+        The lag counts as determined if its uncertainty is below half of this value.
     smooth_s : float
         Window of the smoothing cubic that gives the slope of the pattern; noise in the slope would hide the lag.
 

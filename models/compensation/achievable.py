@@ -1,7 +1,7 @@
 """Achievable accuracy of each kind of compensation table on this machine: residual errors of distances with their uncertainty.
 
-All kinds correct the same identified deviation; its unknown part (`PredictedDistances.unknown_mm`) remains with each of them. Errors are
-first-order ones over the inner 80 % of the strokes.
+All kinds of table correct the same identified deviation; its unknown part (`PredictedDistances.unknown_mm`) remains with each kind.
+Errors are computed to first order over the inner 80 % of the strokes.
 
 This module also makes tables of single error motions, for controls that store up to 21 of them and compute the deviation by their own
 kinematic model. One campaign with one tool does not determine every motion: at one tool length, turning and shifting a carriage look alike.
@@ -48,7 +48,7 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources, varianc
 NODES = 7
 RANK_TOLERANCE = 1e-7
 TOWARDS_ESTIMATE = 1e-6
-"""Weight of a motion's own estimate against the deviation: it only decides combinations of motions that the deviation leaves open."""
+"""Weight of a motion's own estimate relative to the deviation. It matters only for combinations that the deviation leaves open."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -173,7 +173,7 @@ def _entries(sources: ErrorSources, name: str, grids: tuple[F1, F1, F1], keep: l
 
 
 def individually_observable(solution: JointSolution, *, weak: bool = False) -> frozenset[str]:
-    """Return the motions that the report calls observed, with ``weak`` also the weak ones.
+    """Return the motions that the report calls observed; with ``weak``, also the weakly observed motions.
 
     No coefficient of these motions is part of a hidden combination, and the readings carry at least 90 % (weak: 10 %) of the information.
     """
@@ -212,7 +212,7 @@ def _field(solution: JointSolution) -> tuple[list[int], F2]:
 
 
 def _refit(solution: JointSolution, keep: list[int]) -> F2:
-    """Return the coefficients of the kept terms that best reproduce the deviation of one unit of each coefficient, shape (kept, terms)."""
+    """Return the coefficients of the kept terms that best reproduce the deviation by one unit of each coefficient, shape (kept, terms)."""
     smooth, field = _field(solution)
     n = len(smooth)
     kept = [k for k, i in enumerate(keep) if i in set(smooth)]
@@ -369,7 +369,7 @@ class _ResidualJudge:
     lsb_mm: float
 
     def row(self, kind: str, entries: int, stored: Correction | None = None, exact: Correction | None = None) -> Achievable:
-        """Judge a kind of table by its correction as ``stored``; ``exact`` is the same without rounding."""
+        """Judge a kind of table by its correction as ``stored``; ``exact``: the correction without rounding."""
         rounding = 0.0
         if stored is not None and exact is not None:
             added = correction_error_mm(stored, self.pairs) - correction_error_mm(exact, self.pairs)

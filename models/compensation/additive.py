@@ -5,8 +5,8 @@ that depends on two axes remains, and much of it lies along the body diagonals, 
 as much as the whole volume (tests/models/compensation/test_tables.py states gain and cost).
 
 `mean_linear` returns scale errors and squareness as slopes of the main effects. The coefficients of the model hold at the pivots of the
-carriages, where one tool length often cannot separate them from angles. Their mean effect over the volume is known far better, and is what
-people mean by "the" squareness.
+carriages, where one tool length often cannot separate them from angles. Their mean effect over the volume has a far smaller uncertainty,
+and is usually meant by "the squareness" of a machine.
 """
 
 from __future__ import annotations
@@ -41,7 +41,7 @@ def additive_design(
 ) -> tuple[F3, F3, F3]:
     """Return the best additive field per unit of every coefficient of a solution: per axis, shape (len(grid), 3, terms).
 
-    ``terms``: default the solution's own; may hold higher orders too (`abbe.models.uncertainty.sources`).
+    ``terms``: default: those of the solution; may include higher orders (`abbe.models.uncertainty.sources`).
     """
     order = diagonal_order(solution.terms)
     field = _design_of(solution.machine, terms or solution.terms)
@@ -131,7 +131,7 @@ SCALE_NOTE = "at the machine's temperature while it was measured"
 """Note beside every printed scale error: Abbe does not correct it to 20 degree C."""
 
 SQUARENESS_SLOPES = (("C0Y", 0, 1, -1.0), ("B0Z", 0, 2, 1.0), ("A0Z", 1, 2, -1.0))
-"""Squareness, its two axes, and the sign that turns the sum of their slopes into it (docs/explanation/conventions.md)."""
+"""Squareness, its two axes, and the sign by which the sum of their slopes gives it (docs/explanation/conventions.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,9 +146,9 @@ class MeanParameter:
 def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9) -> tuple[MeanParameter, ...]:
     """Return the mean scale errors of X, Y, Z (slopes of EXX, EYY, EZZ) and the mean squareness C0Y, B0Z, A0Z over the volume.
 
-    They are least-squares slopes over equidistant positions. Scale errors hold at the temperature of the machine during the measurement,
+    These are least-squares slopes over equidistant positions. Scale errors hold at the temperature of the machine during the measurement,
     without correction to 20 degree C (1 K of a steel machine is about 11 um/m). Their uncertainty therefore excludes the temperature of the
-    scales and includes all other sources (`abbe.models.uncertainty.sources`). It always includes the laser's wavelength: as an unknown
+    scales; it includes all other sources (`abbe.models.uncertainty.sources`), always also the laser's wavelength: as an unknown
     (`laser_scale`) if a laser was used, otherwise as an assumed uncertainty of the reference length.
     """
     sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # ``common`` holds the wavelength

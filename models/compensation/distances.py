@@ -1,6 +1,6 @@
 """Errors of distances between two points of a part. These are the machine's errors as its user sees them; no rigid motion changes them.
 
-Comparing these errors without and with a compensation table judges the table.
+A comparison of these errors without and with a compensation table judges the table.
 """
 
 from __future__ import annotations
@@ -117,8 +117,8 @@ def predict_distances(
 ) -> PredictedDistances:
     """Predict the distance errors of the identified machine, without or with a correction.
 
-    First order only: a correction also shifts the position at which the machine's error acts; this changes the error by its slope times the
-    correction (0.0001 x 50 um = 5 nm), which is neglected.
+    The prediction is of first order: a correction also shifts the position at which the machine's error acts, and so changes the error by
+    its slope times the correction (0.0001 x 50 um = 5 nm). This change is neglected.
 
     Parameters
     ----------

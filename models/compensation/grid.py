@@ -1,4 +1,4 @@
-"""3-D grid of corrections with trilinear interpolation: unlike one-axis tables, it also corrects the effect of angles at a lever.
+"""3-D grid of corrections with trilinear interpolation. Unlike one-axis tables, a grid also corrects the effect of angles at a lever.
 
 The corrections do not contain the best-fit rigid motion over the grid, which changes no distance between two points of a part. An added
 constant keeps the reference node in place, because a controller's reference point must not move.
@@ -24,7 +24,7 @@ from abbe.models.uncertainty.scales import Scales, scale_projection, without_sca
 from abbe.models.uncertainty.sources import ErrorSources, error_sources
 
 FIT_SAMPLES = 5
-"""Samples per cell for the fit of a function; the fit of a parabola is then within 2 % of the continuous one."""
+"""Samples per cell for the fit of a function; with these, the fit of a parabola is within 2 % of the continuous fit."""
 
 
 def cells(nodes_mm: F1, position_mm: F1) -> tuple[np.ndarray[tuple[int, ...], np.dtype[np.intp]], F1]:
@@ -66,8 +66,8 @@ def fit_positions(nodes_mm: F1) -> F1:
 def fit_operator(nodes_mm: F1) -> F2:
     """Return the matrix from values at `fit_positions` to node values of the least-squares polyline, shape (nodes, samples).
 
-    A polyline through points of a curve lies on one side of it, h^2 f''/8 off in the middle of a cell of length h. The least-squares
-    polyline crosses the curve and leaves about 0.4 times the rms for a parabola (0.6 times for distances in a volume).
+    A polyline through points of a curve lies on one side of the curve, h^2 f''/8 off in the middle of a cell of length h. The least-squares
+    polyline crosses the curve and leaves about 0.4 times that rms for a parabola (0.6 times for distances in a volume).
     """
     x = fit_positions(nodes_mm)
     index, share = cells(nodes_mm, x)
@@ -89,7 +89,7 @@ def fit_operator(nodes_mm: F1) -> F2:
 
 
 SMALL_CORRECTIONS = 1e-2
-"""Weight of keeping corrections small against making distances correct; it matters only if the mask has few nodes."""
+"""Weight of small corrections relative to correct distances; it matters only if the mask has few nodes."""
 
 
 def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.bool_]) -> tuple[F4, NDArray[np.bool_]]:
@@ -133,7 +133,7 @@ def blend(position_mm: tuple[F1, F1, F1], error_mm: F4, compensable: NDArray[np.
 
 
 def _distance_errors(position_mm: tuple[F1, F1, F1], fields_mm: F3, pairs: Pairs) -> F2:
-    """Return the errors of distances in k trilinear fields given at the nodes, shape (nodes, 3, k), as shape (pairs, k)."""
+    """Return the errors of distances, shape (pairs, k), in k trilinear fields that are given at the nodes, shape (nodes, 3, k)."""
     grid = fields_mm.reshape(*(p.size for p in position_mm), -1)
     ends = [trilinear(position_mm, grid, p).reshape(pairs.unit.shape[0], 3, -1) for p in (pairs.first_mm, pairs.second_mm)]
     return np.asarray(np.einsum("ni,nik->nk", pairs.unit, ends[1] - ends[0]))
@@ -174,7 +174,7 @@ class GridTable:
 
     @property
     def largest_step_mm(self) -> float:
-        """Largest change of the correction of any axis from one node to the next; controllers limit it, as steps mark surfaces."""
+        """Largest change of any axis' correction from one node to the next; controllers limit this change, because steps mark surfaces."""
         return max(float(np.abs(np.diff(self.correction_mm, axis=a)).max()) for a in range(3))
 
 
@@ -187,8 +187,8 @@ def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitt
     """Return the node values of the best trilinear field per unit of each coefficient of the solution, shape (nodes, 3, terms).
 
     ``fitted``: fit by least squares over the volume of the grid; otherwise take the deviation at the nodes themselves. A term is at most
-    linear in the other two axes (rule G), where trilinear interpolation is exact, so the fit along its own axis is the fit over the volume
-    (tests/models/compensation/test_tables_grid.py).
+    linear in the other two axes (rule G), and trilinear interpolation of these is exact, so the fit along its own axis is the fit over the
+    volume (tests/models/compensation/test_tables_grid.py).
     """
     counts = tuple(p.size for p in position_mm)
     out: F3 = np.empty((int(np.prod(counts)), 3, len(solution.terms)))
@@ -225,7 +225,7 @@ def grid_table(
     reference : (int, int, int)
         Index of the node that stays in place.
     fitted : bool
-        Fit the interpolant to the field instead of sampling the field at the nodes; this leaves about 0.6 of the rms error between nodes.
+        Fit the interpolant to the field instead of sampling the field at the nodes; a fit leaves about 0.6 of the rms error between nodes.
     sources : ErrorSources, optional
         Sources of uncertainty for ``u_mm``; default: ``error_sources(solution)``.
 
@@ -257,9 +257,9 @@ def compensable_nodes(
 ) -> Mask:
     """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
-    The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes where the part that no
-    reading shows may exceed the deviation are excluded too (`abbe.models.uncertainty.prediction`). ``scales``: scale errors that count
-    neither in the uncertainty nor in this part.
+    The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes are also excluded where an
+    error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors that count
+    neither in the uncertainty nor in this error.
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
@@ -308,6 +308,6 @@ def quantisation_mm(lsb_mm: float) -> float:
     """Return the standard uncertainty of one axis' interpolated correction from rounding to the controller's unit, mm.
 
     Rounding gives each node a standard uncertainty of lsb / sqrt(12). Trilinear interpolation averages eight nodes, which leaves
-    (2/3)^(3/2) of it as rms over a cell. A distance has two ends and sqrt(2) times as much.
+    (2/3)^(3/2) of this value as rms over a cell. A distance has two ends and so sqrt(2) times this uncertainty.
     """
     return float(lsb_mm / np.sqrt(12.0) * (2.0 / 3.0) ** 1.5)

@@ -1,4 +1,4 @@
-"""The best nine tables of an identified machine, and the error that is left with them: fitted over the volume, with all sources."""
+"""The best nine tables of an identified machine, fitted over the volume, and the error that remains with them, from all sources."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ def table_design(
 ) -> tuple[F3, F3, F3]:
     """Return the best nine tables of the deviation per unit of every coefficient, first entries zero: per axis (len(grid), 3, terms).
 
-    ``terms``: default the solution's own; may hold higher orders too, which have an uncertainty only.
+    ``terms``: default: those of the solution; may include higher orders, which have only an uncertainty.
     """
     x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes, terms))
     return x, y, z
@@ -81,7 +81,7 @@ def predict_residual(solution: JointSolution, tables: NineTables, *, nodes: int 
 def model_uncertainty_mm(solution: JointSolution, *, nodes: int = 9, sources: ErrorSources | None = None) -> float:
     """Return the rms over the volume of the standard uncertainty of the identified deviation vector, rigid motion removed, mm.
 
-    It includes all sources: noise, set-ups, typical sizes, higher orders, wavelength, temperatures.
+    All sources are included: noise, set-ups, typical sizes, higher orders, wavelength, temperatures.
     """
     grid = volume_grid(solution.machine.stroke_mm, nodes)
     return budget_over(predict_deviation(sources or error_sources(solution), grid, frame=RigidFree(grid))).u_mm

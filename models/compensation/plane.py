@@ -1,8 +1,7 @@
 """One-axis tables from a deviation that is known in a part of the strokes only: in planes at one or several heights, or in a box.
 
-The axes that span this part correct each other in the directions that were sensed. Beyond the known part the tables hold their end values.
-This is an assumption, as are the values at other positions of an axis that no plane spans. A direction that was not sensed is not
-corrected.
+The axes that span this part correct each other in the directions that were sensed; other directions are not corrected. Beyond the known
+part the tables keep their end values. This is an assumption, as are the values at other positions of an axis that no plane spans.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ NODES = {2: 13, 3: 7}
 
 
 def partial_tables(machine: Machine, boxes_mm: Sequence[F2], known: Known, counts: tuple[int, int, int]) -> tuple[NineTables, Predicted]:
-    """Return the tables that are best over all boxes together, and the rms in them before and after the tables.
+    """Return the tables that are best over all boxes together, and the rms in the boxes before and after the tables.
 
     Parameters
     ----------
@@ -29,7 +28,7 @@ def partial_tables(machine: Machine, boxes_mm: Sequence[F2], known: Known, count
         Parts of the strokes in which the deviation is known, except for one unknown rigid motion per part. Planes have an extent of zero
         along their third axis; all boxes are spanned by the same axes.
     known : function
-        `Known`; rigid motion removed over the points that it is asked for.
+        Returns deviation and uncertainty (`Known`) at points, without the rigid motion over these points.
     counts : (int, int, int)
         Grid points of X, Y, Z.
     """

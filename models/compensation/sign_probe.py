@@ -20,7 +20,7 @@ from abbe.models.compensation.tables import NineTables
 from abbe.models.machine import AXES
 
 FLOOR_MM, SHARE = 0.002, 0.2
-"""Tolerance of a response: the larger of an absolute value, mm, and a share of the expected change."""
+"""Tolerance of a response: the larger of an absolute value (`FLOOR_MM`) and a share of the expected change (`SHARE`)."""
 KNOWN_RATIOS = ((1000.0, "µm taken for mm"), (25.4, "mm taken for inch"), (1e-3, "mm taken for µm"), (1 / 25.4, "inch taken for mm"))
 
 
@@ -102,7 +102,7 @@ def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_m
 
 @dataclass(frozen=True)
 class SignProof:
-    """Result of a step in X, in Y and in Z.
+    """Result of a step in each of X, Y and Z.
 
     ``response``, shape (3, 3): element [i, a] is component i of the shift over the step written for axis a; ``u``: its standard
     uncertainty. ``faults``: one sentence for each axis that does not respond as written; empty if sign, axis and unit are proved.
@@ -120,7 +120,7 @@ class SignProof:
 
 
 def sign_proof(step_mm: float, shifts: tuple[Shift, Shift, Shift]) -> SignProof:
-    """Judge the shifts by a step in X, in Y and in Z: a positive correction must move its own axis in the positive direction.
+    """Judge the shifts that a step in X, in Y and in Z causes: a positive correction must move its own axis in the positive direction.
 
     A response whose expanded uncertainty exceeds half the tolerance is a fault as well, because it proves nothing.
     """

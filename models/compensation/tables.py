@@ -25,8 +25,8 @@ class NineTables:
 
     ``u_mm``, of the same shapes: standard uncertainty of each entry relative to the first one of its table, from all sources
     (`abbe.models.uncertainty.sources`), in the frame without rigid motion over the volume (docs/explanation/conventions.md, "Frame"). The
-    slope of a cross table is partly a rotation of the whole frame. No reading shows this rotation, it changes no distance on a part, and
-    its value here is arbitrary: remove the best-fit rotation before you compare tables.
+    slope of a cross table is partly a rotation of the whole frame. No reading shows this rotation, the rotation changes no distance on a
+    part, and its value here is arbitrary: remove the best-fit rotation before you compare tables.
     """
 
     position_mm: tuple[F1, F1, F1]
@@ -43,7 +43,7 @@ class NineTables:
 
 
 def grid_positions(machine: Machine, counts: tuple[int, int, int]) -> tuple[F1, F1, F1]:
-    """Return an equidistant grid per axis over its stroke, the pitch rounded down to 10 nm so that the controller stores it exactly."""
+    """Return an equidistant grid per axis over its stroke; the pitch is rounded down to 10 nm, so that the controller stores it exactly."""
     grids = []
     for a, n in enumerate(counts):
         if n < 2:
@@ -67,7 +67,7 @@ def quantise(tables: NineTables, lsb_mm: float) -> NineTables:
 
 
 def check_unit(lsb_mm: float) -> None:
-    """Refuse a controller's unit that is not a positive number; entries cannot be rounded to it."""
+    """Refuse a controller's unit that is not a positive number, because entries cannot be rounded to it."""
     if not (np.isfinite(lsb_mm) and lsb_mm > 0):
         raise ValueError(f"tables: the controller's unit is {lsb_mm} mm, but must be a positive number")
 
@@ -82,7 +82,7 @@ class Predicted:
 
 
 WITHIN_MM = 5e-4
-"""Largest difference, mm, between a smooth table and its polynomial; tables that differ more hold pitch errors or manual entries."""
+"""Largest difference, mm, between a smooth table and its polynomial; tables that differ more contain pitch errors or manual entries."""
 ORDERS = range(2, 13)
 
 

@@ -17,7 +17,7 @@ from abbe.models.functions.legendre import legendre_values
 from abbe.models.machine import AXES
 
 UM, PPM = 1e-3, 1e-6
-"""A micrometre in mm; one part per million. Columns are mm per UNIT of strength, so that coefficients have the unit shown to people."""
+"""One micrometre in mm; one part per million. Columns are mm per UNIT of strength, so that coefficients have the unit shown to people."""
 AXIS_KEYS = ("X", "Y", "Z")
 LATERAL_KEYS = ("EYX", "EZX", "EXY", "EZY", "EXZ", "EYZ")
 """Straightness components: the axis of the third letter moves, the tool deviates along that of the second."""
@@ -25,23 +25,24 @@ NO_KEY = ("",)
 STEEL_PER_K = 11.5e-6
 """Thermal expansion of steel, 1/K."""
 AIR_PER_K = -0.93e-6
-"""Relative error of a laser reading per kelvin, 1/K: warm air is thin, so the laser reads short. It is dn/dT at 20 degree C, 101325 Pa and
-constant vapour pressure; at constant relative humidity it is -0.96e-6 (Edlen equation by Birch and Downs, Metrologia 30 (1993) 155)."""
+"""Relative error of a laser reading per kelvin, 1/K: warm air is thin, so the laser reads short. The value is dn/dT at 20 degree C,
+101325 Pa and constant vapour pressure; at constant relative humidity -0.96e-6 (Edlen equation by Birch and Downs, Metrologia 30 (1993)
+155)."""
 CAMPAIGN_S = (600.0, 12000.0)
 """Range of time constants, s, that a campaign of hours can separate from a constant and from a straight line."""
 
 VISITED = (2.0 / 3.0) ** 2 / 3.0
-"""Mean square of the position x (-1 .. +1 over the stroke) in the middle two thirds, where tests go. The form x^2 - VISITED has mean zero
+"""Mean square of the position x (-1 .. +1 over the stroke) in the middle two thirds, where tests move. The form x^2 - VISITED has mean zero
 there and so does not change the strength."""
 BLOCKS = 4
 """Number of blocks into which a run is divided to average its temperatures."""
 
 Deviation = Callable[[Places, str, Values], F3]
 WITH_LINE = (2.5, 1.5)
-"""Ratio of the rms of a smooth curve to its rms without the straight line, which scale and squareness absorb, and its standard uncertainty.
+"""Ratio of the rms of a smooth curve to its rms without the straight line, which scale and squareness absorb; with standard uncertainty.
 For stationary curves with a correlation length of 0.3 strokes the median is 2.6, and two of three curves have 1.5 to 5."""
 WITH_CONSTANT = (1.4, 0.7)
-"""The same ratio for a curve without its mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
+"""Ratio of the rms of a smooth curve to its rms without its mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
 
 
 def axis_of(key: str) -> int:
@@ -110,7 +111,7 @@ def of_body(deviation: Callable[[Path, Places, str, Values], F3], turn: Callable
 
 
 def of_kind(kind: str, reading: Callable[[Path, str, Values], F2], columns: int) -> Signal:
-    """Make a signal that only one kind of instrument reads, ``"bar"`` or ``"laser"``; runs of the other get ``columns`` zero columns."""
+    """Make a signal that only one kind of instrument reads, ``"bar"`` or ``"laser"``; other runs get ``columns`` columns of zeros."""
 
     def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
         return [reading(path, key, values) if path.kind == kind else np.zeros((path.n, columns)) for path in paths]
@@ -151,9 +152,9 @@ def wind_up(at: Places, axis: int, *over_mm: float) -> list[F1]:
 
 
 def before_first_turn(at: Places, axis: int) -> F1:
-    """Return the travel of an axis since the first reading, mm, but `FAR_MM` once it has reversed.
+    """Return the travel of an axis since the first reading, mm; `FAR_MM` after its first reversal.
 
-    Effects use it to describe what is left of a reversal in the unrecorded run-in before the first reading.
+    Effects use this travel to describe the rest of a reversal in the unrecorded run-in before the first reading.
     """
     if len(at.t_s) < 2 or not at.v_mm_s.any():
         return np.full(len(at.t_s), FAR_MM)
@@ -164,14 +165,14 @@ def before_first_turn(at: Places, axis: int) -> F1:
 def play(at: Places, axis: int, width_mm: float = 0.008) -> F1:
     """Return the position of an axis within its play, from -1 to +1 in the direction of motion, shape (n,).
 
-    After a reversal the axis stays until the command has travelled the width. The reversal is taken at the outermost commanded position.
+    After a reversal the axis stays until the command has travelled the width of the play. The outermost command is taken as reversal.
     """
     sign, since = commanded_turns(at, axis)
     return np.asarray(sign * np.clip(2.0 * since / width_mm - 1.0, -1.0, 1.0))
 
 
 def turn_between(at: Places, axis: int) -> F1:
-    """Return a sudden step at the true point of reversal, which may lie between two readings, minus `play`."""
+    """Return a sudden step at the true point of reversal (possibly between two readings), minus `play`."""
     return np.asarray(at.sign[:, axis] - play(at, axis))
 
 
@@ -199,7 +200,7 @@ def rise_of(paths: tuple[Path, ...], sensor: str) -> Callable[[F1], F1] | None:
 
 
 def with_sensor(deviation: Callable[[Path, Places, str, Values, F1], F3], sensor_of: Callable[[str], str]) -> Signal:
-    """Make a signal that follows the rise of the temperature sensor which ``sensor_of(key)`` names; zeros if no run has it."""
+    """Make a signal that follows the rise of the temperature sensor that ``sensor_of(key)`` names; zeros if no run has this sensor."""
 
     def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
         rise = rise_of(paths, sensor_of(key))
@@ -241,7 +242,7 @@ def size(coefficients: F1, values: Values) -> float:
 
 
 def setup_length(parts: int) -> Callable[[F1, Values], float]:
-    """Make a strength function: the rms, over set-ups, of the length of their ``parts`` coefficients; all-zero set-ups do not count."""
+    """Make a strength function: the rms over set-ups of the length of their ``parts`` coefficients, without set-ups of zeros only."""
 
     def strength(coefficients: F1, values: Values) -> float:
         lengths = np.linalg.norm(np.reshape(coefficients, (-1, parts)), axis=1)
@@ -260,8 +261,8 @@ def smooth(position_mm: F1, stroke_mm: F1, first: int, last: int) -> F2:
 def shifts(direction: Callable[[str], int], first: int, last: int) -> Signal:
     """Make the signal of a translation that varies smoothly along the moving axis (`axis_of`).
 
-    It has one column per Legendre order from ``first`` to ``last``, each 1 um rms over the stroke. ``direction``: returns, for the key of
-    an effect, the index (0 to 2) of the direction in which the tool deviates.
+    The signal has one column per Legendre order from ``first`` to ``last``, each 1 um rms over the stroke. ``direction``: function from an
+    effect's key to the index (0 to 2) of the direction in which the tool deviates.
     """
 
     def moved(path: Path, at: Places, key: str, values: Values) -> F3:

@@ -16,12 +16,12 @@ from abbe.models.machine import Machine
 
 Kind = Literal["bar", "laser"]
 FAR_MM = 1e9
-"""Stands for the travel since the last reversal if an axis has not reversed yet."""
+"""Value of the travel since the last reversal of an axis that has not reversed yet."""
 
 
 @dataclass(frozen=True)
 class Places:
-    """Position and motion of the tool, one row per time: all on which an effect of the machine may depend.
+    """Position and motion of the tool, one row per time. An effect of the machine may depend on nothing else.
 
     Attributes
     ----------
@@ -49,9 +49,9 @@ class Places:
 
     @cached_property
     def commanded_turns(self) -> tuple[F2, F2]:
-        """``sign`` and ``since_mm`` as if every axis reversed at a commanded position and not between two of them, shape (n, 3) each.
+        """``sign`` and ``since_mm`` if every axis reversed at a commanded position and not between two of them, shape (n, 3) each.
 
-        If the machine dwells, they are ``sign`` and ``since_mm`` themselves.
+        If the machine dwells, the results are ``sign`` and ``since_mm`` themselves.
         """
         n = len(self.t_s)
         if n < 2 or not self.v_mm_s.any():
@@ -82,6 +82,7 @@ class Path:
     look : array, shape (n, 3)
         Direction of measurement, unit vector from cup to tool or along the beam: the reading per mm of deviation, to first order.
     feed_mm_min, direction : array, shape (n,)
+        Commanded feed; direction of motion along the path, by its sign.
     travel_mm : array, shape (n,)
         Nominal displacement along the beam since the first record; zero for a bar.
     t_set_s : float
@@ -89,7 +90,7 @@ class Path:
     dead_path_mm : float
         Length of the laser path outside the measured travel.
     radius_mm, centre_mm : float, array, shape (3,)
-        Of the ball-bar's sphere; zero for a laser.
+        Radius and centre of the ball-bar's sphere; zero for a laser.
     """
 
     label: str
@@ -155,8 +156,8 @@ RUN_IN = 2
 def driven(q_mm: F2, t_s: F1, feed_mm_min: F1, *, dwelling: bool, temp_c: Mapping[str, F1]) -> Places:
     """Return the `Places` of a sequence of commanded positions, mm, at times ``t_s``.
 
-    A moving axis reverses between two samples. The velocities on both sides give the point of reversal, at constant acceleration; backlash
-    and friction in the next samples depend on the travel from this point.
+    A moving axis reverses between two samples. The point of reversal follows from the velocities on both sides at constant acceleration;
+    backlash and friction in the next samples depend on the travel from this point.
 
     Parameters
     ----------
@@ -191,7 +192,7 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
     Parameters
     ----------
     step_mm : array, shape (n, 3), optional
-        Motion per sample, at every sample. With it, an axis reverses where it comes to rest between two samples; without it, at a sample.
+        Motion per sample, at every sample. If given, an axis reverses where it comes to rest between two samples; otherwise at a sample.
     """
     travel = np.abs(np.diff(q_mm, axis=0, prepend=q_mm[:1])).cumsum(axis=0)
     out = np.full(q_mm.shape, FAR_MM)

@@ -1,4 +1,4 @@
-"""Check that an effect, built-in or plug-in, keeps the rules of its declaration; its columns are tried on a small synthetic campaign."""
+"""Check that an effect, built-in or plug-in, keeps the rules of a declaration; its columns are tried on a small synthetic campaign."""
 
 from __future__ import annotations
 

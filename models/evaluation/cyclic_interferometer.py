@@ -1,8 +1,9 @@
 """Cyclic error of an interferometer (periodic nonlinearity): orders 1 and 2 per fringe, from its quadrature signals or a slow linear run.
 
-Signals with offsets, unlike gains, or not in quadrature describe an ellipse, and their phase errs once (offsets) and twice (gain,
-quadrature) per fringe. An ellipse is fitted (Heydemann, Appl. Opt. 20 (1981) 3382), robustly against single bad samples. Uncertainties are
-those of a jackknife over blocks of neighbouring samples, so that they hold for autocorrelated noise and for shapes other than an ellipse.
+Signals with offsets, with different gains, or not in quadrature describe an ellipse; the error of their phase has a period of one fringe
+(offsets) and of half a fringe (gain, quadrature). An ellipse is fitted (Heydemann, Appl. Opt. 20 (1981) 3382), robustly against single bad
+samples. Uncertainties come from a jackknife over blocks of neighbouring samples, so that they hold for autocorrelated noise and for shapes
+other than an ellipse.
 """
 
 from __future__ import annotations
@@ -23,15 +24,15 @@ LEAST_SECTORS = 9
 """Sectors of a fringe that must hold samples, out of `SECTORS`."""
 LEAST_SAMPLES = 4 * BLOCKS
 BISQUARE, ROUNDS = 4.685, 20
-"""Tukey's constant, in robust standard deviations, and the largest number of times that the weights are computed again."""
+"""Tukey's constant, in robust standard deviations; largest number of recomputations of the weights."""
 GRID: F1 = np.arange(256.0) * (2.0 * np.pi / 256.0)
 TREND = 3
-"""Degree of the polynomial that a linear run may have beside the cyclic error."""
+"""Degree of the polynomial trend that a linear run may have in addition to the cyclic error."""
 
 
 @dataclass(frozen=True)
 class CyclicOrder:
-    """Error ``amplitude`` sin(``order`` phase + ``start_rad``), with standard uncertainties; ``p``: probability that chance gives as much.
+    """Error ``amplitude`` sin(``order`` phase + ``start_rad``), with standard uncertainties; ``p``: probability of such an error by chance.
 
     Unit of the amplitude: that of the fringe.
     """
@@ -69,7 +70,7 @@ class Ellipse:
 class CyclicError:
     """Cyclic error of an interferometer, in the unit of ``fringe`` (displacement per period of its signals).
 
-    ``ellipse``: None for a linear run; ``scatter``: robust standard deviation of what is left, relative to the radius for signals;
+    ``ellipse``: None for a linear run; ``scatter``: robust standard deviation of the residuals, relative to the radius for signals;
     ``outliers``: share of samples that do not count.
     """
 
@@ -87,7 +88,7 @@ class CyclicError:
 
 
 def from_quadrature(x: F1, y: F1, fringe: float) -> CyclicError:
-    """Fit an ellipse to signals x, y (n,), samples in the order in which they were taken.
+    """Fit an ellipse to signals x, y (n,), in the order of sampling.
 
     Raises
     ------
@@ -128,7 +129,7 @@ def _check(samples: int, phase: F1) -> None:
 
 
 def _ellipse(x: F1, y: F1) -> tuple[Ellipse, F1, F1]:
-    """Ellipse, weights of the samples, and what is left over of their relative radius."""
+    """Ellipse, weights of the samples, and residuals of their relative radius."""
     middle = np.median(x), np.median(y)
     scale = float(np.median(np.hypot(x - middle[0], y - middle[1])))
     if not scale > 0.0:

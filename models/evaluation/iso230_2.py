@@ -1,8 +1,8 @@
 """ISO 230-2: accuracy and repeatability of positioning of a linear axis, from approaches of the same positions from both sides.
 
 Index i counts positions (1 to m), j cycles (1 to n); single approaches may be missing. The standard uncertainties follow ISO/TR 230-9: the
-scatter of the cycles and the contributions of instrument and temperature are propagated through each figure's own formula. They are not
-the closed formulas of ISO 230-2's annex, which hold for five cycles.
+scatter of the cycles and the contributions of instrument and temperature are propagated through each figure's own formula. The closed
+formulas of ISO 230-2's annex are not used, because they hold for five cycles.
 """
 
 from __future__ import annotations
@@ -53,8 +53,8 @@ class ScaleBudget:
     """Standard uncertainties that the repeats do not show.
 
     ``slope``: uncertainty of a common slope of all deviations, mm per mm (wavelength, temperature and expansion of the scales). Each figure
-    is evaluated again with the deviations tilted by it, so that a flat axis has this uncertainty, too. ``reading_mm``: uncertainty of the
-    mean at each position, independent from position to position (resolution, drift of the environment).
+    is evaluated again with the deviations tilted by this slope, so that a flat axis has this uncertainty, too. ``reading_mm``: uncertainty
+    of the mean at each position, independent from position to position (resolution, drift of the environment).
     """
 
     slope: float = 0.0
@@ -71,7 +71,7 @@ class Value:
 
 @dataclass(frozen=True, slots=True)
 class Positioning:
-    """All figures of ISO 230-2 of a bidirectional test, mm. Arrays have the shape (m,). None: a single cycle shows no scatter.
+    """All figures of ISO 230-2 of a bidirectional test, mm. Arrays have the shape (m,). None: not known, because one cycle has no scatter.
 
     ``mean_forward_mm``, ``mean_backward_mm``, ``mean_mm``: mean deviations; ``reversal_mm``: B_i; ``s_forward_mm``, ``s_backward_mm``:
     standard deviations of the approaches. ``lowest``, ``most``: fewest and most approaches of a position from one side. All other
@@ -196,7 +196,7 @@ def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
 
 
 def _tilt(at: F1, upper: F1, lower: F1, budget: ScaleBudget) -> float:
-    """Return how much max(upper) - min(lower) changes at most if all deviations tilt by plus or minus the slope's uncertainty."""
+    """Return the largest change of max(upper) - min(lower) if all deviations tilt by plus or minus the slope's uncertainty."""
     along = budget.slope * (at - at.min())
     plain = np.max(upper) - np.min(lower)
     return max(float(abs(np.max(upper + t) - np.min(lower + t) - plain)) for t in (along, -along))

@@ -18,7 +18,7 @@ from abbe.models.solvers.observations import reading_noise_mm
 BINS = 360
 """Sectors of the circle, one degree each, whose means compare the two paths."""
 FULL_RAD = np.deg2rad(350.0)
-"""A path that covers less is an arc (`OnePath.is_whole`), whose least squares centre is less certain."""
+"""A path that covers less is an arc (`OnePath.is_whole`), and its least squares centre is less certain."""
 ZONE_POINTS = 2000
 """Largest number of readings for the minimum zone. A longer path is cut into `ZONE_POINTS` / 2 stretches; their highest and lowest readings
 count."""
@@ -49,7 +49,7 @@ class CircularTest:
 class OnePath:
     """Figures of one path, mm.
 
-    ``G_mm``, ``G_zone_mm``: by least squares; by the minimum zone, NaN if the search fails. ``centre_mm``: least squares centre minus the
+    ``G_mm``, ``G_zone_mm``: G by least squares; by the minimum zone, NaN if the search fails. ``centre_mm``: least squares centre minus the
     set-up's centre; ``radius_mm``: least squares radius minus the nominal one. ``F_max_mm``, ``F_min_mm``: extremes of the radial deviation
     about the set-up's centre; ``..._centred_mm``: about the least squares centre. ``noise_mm``: standard deviation of one reading.
     """

@@ -36,11 +36,11 @@ def diagonals(
     Parameters
     ----------
     readings : mapping of str to Approaches
-        By name, a letter per axis: ``p`` grows along the diagonal, ``n`` falls. Positions are distances along the diagonal.
+        Readings by name of the diagonal, a letter per axis: ``p`` grows along the diagonal, ``n`` falls. Positions are distances along it.
     wanted : iterable of str
         Names that the standard asks for: `BODY` or `FACE`.
     budgets : mapping of str to ScaleBudget, optional
-        Of every diagonal; without it the uncertainties contain only the scatter of the cycles.
+        Budget of every diagonal; without it the uncertainties contain only the scatter of the cycles.
 
     Raises
     ------

@@ -1,13 +1,13 @@
 """Reduction of positioning deviations to 20 °C: correction of the nominal differential expansion (NDE) of scale and laser.
 
-ISO 230-2 (2014, clause 4.1, Environment) wants results as if everything were at 20 °C, the reference temperature of ISO 1: measured at
-another temperature, they are corrected for the nominal differential expansion between the axis' measuring system and the test equipment.
-Uncertainty as in ISO/TR 16015: temperature and coefficients are independent contributions.
+ISO 230-2 (2014, clause 4.1, Environment) requires results as if everything were at 20 °C, the reference temperature of ISO 1: results at
+another temperature are corrected for the nominal differential expansion between the axis' measuring system and the test equipment. The
+uncertainty follows ISO/TR 16015: temperature and coefficients are independent contributions.
 
 Convention. Displacements and deviations grow with the axis coordinate; deviation = displacement read - displacement commanded. At t °C a
 scale of coefficient a moves the axis by (1 + a (t - 20)) for each commanded mm. A laser reads true length, so its coefficient is 0. If its
-own compensation of material expansion is on, it has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L the reading of
-its own sensor of material temperature. Let the scale be at T, t = T + e and t_L = T + e_L. The measurement contains a (T - 20) -
+own compensation of material expansion is on, the laser has already taken off b (t_L - 20) for each mm; b is its coefficient, t_L the
+reading of its own sensor of material temperature. Let the scale be at T, t = T + e and t_L = T + e_L. The measurement contains a (T - 20) -
 b (T + e_L - 20), the correction removes (a - b) (T + e - 20), and -(a - b) e - b e_L remains. The errors e and e_L are independent and
 have the same u(t).
 
@@ -51,8 +51,8 @@ class Strain(Protocol):
 class Expansion:
     """Expansion of one axis' scale against the laser during a test. Every ``u_`` is a standard uncertainty.
 
-    ``scale_per_k``: expansion coefficient of the scale, or of the screw of an axis without a scale, 1/K; ``temperature_c``: its
-    temperature, °C, and ``u_temperature_k`` in K; ``laser_per_k``: coefficient of the laser's own compensation of material, 1/K, 0: off.
+    ``scale_per_k``: expansion coefficient of the scale, or of the screw of an axis without a scale, 1/K; ``temperature_c``: temperature of
+    this scale or screw, °C (``u_temperature_k`` in K); ``laser_per_k``: coefficient of the laser's own material compensation, 1/K (0: off).
     """
 
     scale_per_k: float
@@ -141,9 +141,9 @@ def reduced(readings: Approaches, expansion: Strain) -> Approaches:
     Parameters
     ----------
     readings : Approaches
-        As measured, mm.
+        Deviations as measured, mm.
     expansion : Strain
-        Of an axis or a diagonal; one temperature of each scale for the whole test.
+        Strain of the axis or diagonal; each scale has one temperature during the whole test.
     """
     taken_off = (expansion.strain * (readings.position_mm - readings.position_mm[0]))[:, None]
     return replace(readings, forward_mm=readings.forward_mm - taken_off, backward_mm=readings.backward_mm - taken_off)

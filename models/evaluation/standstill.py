@@ -1,4 +1,4 @@
-"""Test at standstill (ISO 230-3): a model of the thermal response, judged on runs that it has not seen."""
+"""Test at standstill (ISO 230-3): a model of the thermal response, judged on runs to which it was not fitted."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ COVERED = 0.95
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
-    """Every run predicted from all the others. Each rms, mm, is over all runs, and each run has the same weight.
+    """Predictions of every run from all other runs. Each rms, mm, is over all runs, and each run has the same weight.
 
     ``predicted_mm``, ``u_mm``: by run, (n,) each. ``raw_mm``: rms of the displacements; ``static_mm``: rms that a model without lag leaves
-    (least squares); ``response_mm``: rms that the response leaves. ``covered``: share of readings within U (k = 2); U is widened by the
-    factor that all other runs need.
+    (least squares); ``response_mm``: rms that the response leaves. ``covered``: share of readings within U (k = 2), where U is widened by
+    the factor that the other runs need.
     """
 
     predicted_mm: tuple[F1, ...]
@@ -35,8 +35,8 @@ class LeftOut:
 class Standstill:
     """Result of a test at standstill. Two models compete: one of absolute temperatures, one of their changes since the start of each run.
 
-    ``since_start``: the model of changes predicts better; ``response``, ``left_out``: of the better model; ``shift_absolute``,
-    ``shift_since_start``: offset of some runs that the one or the other model does not explain, None without such an offset.
+    ``since_start``: whether the model of changes predicts better; ``response``, ``left_out``: those of the better model;
+    ``shift_absolute``, ``shift_since_start``: offset of some runs that the one model, or the other, does not explain; None without one.
     """
 
     since_start: bool
@@ -66,7 +66,7 @@ def standstill(runs: Sequence[StandstillRun]) -> Standstill:
 
 
 def _left_out(series: Series) -> tuple[LeftOut, float]:
-    """Predict every run from all the others; also the factor by which u must be widened to cover them."""
+    """Predict every run from all others; return also the factor by which u must be widened to cover the runs."""
     predicted, u, static = list[F1](), list[F1](), list[F1]()
     for k, run in enumerate(series.runs):
         kept = [i for i in range(len(series.runs)) if i != k]
@@ -84,7 +84,7 @@ def _left_out(series: Series) -> tuple[LeftOut, float]:
 
 
 def _widening(ratio: Sequence[F1]) -> float:
-    """Factor on u, 1 or more, with which 2 u covers its share of errors; ``ratio``: error over u of each run."""
+    """Factor on u, 1 or more, with which 2 u covers the share `COVERED` of the errors; ``ratio``: error divided by u, of each run."""
     return max(1.0, 0.5 * float(np.quantile(np.concatenate(ratio), COVERED)))
 
 

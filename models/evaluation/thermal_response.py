@@ -24,7 +24,7 @@ from abbe.models.probability import t_above
 REFERENCE_C = 20.0
 """ISO 1."""
 BLOCK_S = 300.0
-"""Readings are averaged over this time before the fit; heat moves a machine slower."""
+"""Readings are averaged over this time before the fit; heat deforms a machine more slowly."""
 TIME_CONSTANTS_S = tuple(60.0 * m for m in (3, 5, 8, 12, 16, 20, 25, 30, 40, 60, 90, 120, 180))
 MEMORIES_S = tuple(60.0 * m for m in (20, 45, 100, 250, 500))
 SENSITIVITIES_MM = tuple(1e-3 * v for v in (0.5, 1, 2, 4, 8, 16, 32))
@@ -32,14 +32,14 @@ SENSITIVITIES_MM = tuple(1e-3 * v for v in (0.5, 1, 2, 4, 8, 16, 32))
 OFFSETS_MM = tuple(1e-3 * v for v in (0.1, 0.3, 1, 2, 3, 4, 6, 9, 14, 20))
 SCATTERS_MM = tuple(1e-3 * v for v in (0.1, 0.2, 0.5, 1, 1.5, 2, 3, 4, 6, 9, 14))
 WIDE_MM = 1.0
-"""Prior standard deviation of the displacement at 20 degrees C and of a shift: so wide that it leaves them free."""
+"""Prior standard deviation of the displacement at 20 degrees C and of a shift, so wide that both are free."""
 CHANCE = 0.01
-"""A shift of several runs is claimed below this p-value, which counts all tried beginnings and ends."""
+"""A shift of several runs is claimed below this p-value, which is corrected for the number of tried beginnings and ends."""
 LEAST_RUNS = 5
 UNLIKELY = 7.0
 """A time constant does not count if its log evidence is lower than the best by more than this: odds of one to a thousand."""
 LEAST_U_MM = 1e-5
-"""Least standard uncertainty of a predicted displacement: reading and temperatures are not known better."""
+"""Least standard uncertainty of a predicted displacement; readings and temperatures do not allow less."""
 
 Grid = tuple[float, float, float, float]
 """Prior of a sensitivity (mm/K), offset of a run (mm), scatter (mm), memory of the scatter (s)."""
@@ -84,9 +84,9 @@ class StandstillRun:
 
 @dataclass(frozen=True)
 class Shift:
-    """An offset from run ``first`` to run ``last`` (places in the order of the runs) that the temperatures do not explain.
+    """An offset from run ``first`` to run ``last`` (indices in the order of the runs) that the temperatures do not explain.
 
-    ``p``: probability that chance gives as large an offset, over all beginnings and ends.
+    ``p``: probability that chance gives an equal or larger offset, over all beginnings and ends.
     """
 
     first: int
@@ -102,9 +102,9 @@ class Shift:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Fit of one time constant; ``since_start``: to changes of temperature since the start of each run.
+    """Fit for one time constant; ``since_start``: the fit uses changes of temperature since the start of each run.
 
-    ``mean``, ``covariance``: of two sensitivities for each sensor, the displacement at 20 degrees C, and a shift.
+    ``mean``, ``covariance``: values and covariance of two sensitivities for each sensor, the displacement at 20 degrees C, and a shift.
     """
 
     since_start: bool
@@ -242,7 +242,7 @@ class Series:
 
 
 def shift_of(series: Series, kept: Sequence[int], fit: Fit) -> Shift | None:
-    """The most significant offset of two or more neighbouring runs, the first two excluded; None if chance explains it.
+    """The most significant offset of two or more neighbouring runs, not the first two; None if chance explains the offset.
 
     Each place is tried with several scatters from run to run. At the best place all noise is fitted again, because a fit without a shift
     counts the shift as noise. The p-value is multiplied by the number of places.
@@ -266,7 +266,7 @@ def _sigmas(fit: Fit) -> float:
 def probability_shifted(shift: Shift | None, kept: Sequence[int], run: float) -> float:
     """Probability that the shift acts in a run that was not fitted: 0, 1, or a half between a run with and one without it.
 
-    ``run``: its place among the runs ``kept``, which may lie between two of them.
+    ``run``: position of this run among the runs ``kept``, possibly between two of them.
     """
     if shift is None:
         return 0.0

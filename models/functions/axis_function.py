@@ -13,7 +13,7 @@ from abbe.models.arrays import F1, F2
 class AxisFunction(Protocol):
     """An error motion as a function of the position of ONE axis: mm for translations, rad for angles.
 
-    Every kind is linear in its parameters, ``f(x) == basis(x) @ parameters``; fits and uncertainties rely on that.
+    Every kind of function is linear in its parameters, ``f(x) == basis(x) @ parameters``; fits and uncertainties rely on that.
     """
 
     @property

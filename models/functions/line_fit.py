@@ -37,7 +37,7 @@ def straight_line(x: F1, y: F1) -> tuple[float, float]:
 def slope_through_origin(x: F1, y: F1) -> float:
     """Return the least-squares slope of a line through (0, 0), as in the laser columns of Yang and Kim's Table 2.
 
-    Shapes, units and errors as in `straight_line`, but one position other than zero is enough.
+    Shapes, units and errors are those of `straight_line`, but one position other than zero is enough.
     """
     a, b = _pair(x, y)
     power = float(a @ a)

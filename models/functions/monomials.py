@@ -108,8 +108,8 @@ def individual_terms(terms: tuple[Monomial, ...], u: F2, angle_scale: float = 1.
     Returns
     -------
     list of (slice, ErrorArrays)
-        The terms in the batch, and their values, one term after the other: k n positions for k terms. An `ErrorArrays` has one set of
-        squareness values only, so every squareness term is a batch of its own.
+        The terms in the batch, and their values, one term after the other: k n positions for k terms. An `ErrorArrays` has only one set of
+        squareness values, so every squareness term is a separate batch.
     """
     n, out = u.shape[0], []
     functions = next((k for k, t in enumerate(terms) if t.kind == "S"), len(terms))

@@ -193,8 +193,8 @@ class Straightened:
 class ErrorMotions:
     """Error motions as functions of the axis positions (file format ``abbe-errors/1``, docs/how-to/errors.md).
 
-    Squareness multiplies the travel from AXIS ZERO. `abbe.models.geometry.bases` counts from the start of the stroke; the two differ by a
-    constant offset of the whole map.
+    Squareness multiplies the travel from AXIS ZERO. `abbe.models.geometry.bases` counts from the start of the stroke; the resulting maps
+    differ by a constant offset.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ class ErrorMotions:
             Commanded positions.
         direction : array, shape (n, 3), optional
             Sign of the last move of each axis, as `abbe.models.geometry.chain.travel_sign` returns it. The ``@reverse`` functions hold
-            where it is negative, the plain ones elsewhere; without it, the plain ones everywhere.
+            where this sign is negative, the plain ones elsewhere; without ``direction``, the plain ones everywhere.
 
         Returns
         -------
@@ -281,7 +281,7 @@ class ErrorMotions:
         Raises
         ------
         ValueError
-            A name is not a parameter of these motions, or `motions` would raise.
+            A name is not a parameter of these motions, or an error as in `motions`.
         """
         axes, signs = _checked(axes_mm, direction)
         wanted, known = tuple(names), set(self.parameter_names())
@@ -307,7 +307,7 @@ class ErrorMotions:
     def straightened(self, stroke_mm: ArrayLike) -> Straightened:
         """Move the slopes of all straightness errors into squareness, and return the rigid motion by which the deviation changes.
 
-        `as_straightness` says which lines these are.
+        The slopes are those of the lines that `as_straightness` removes.
 
         Parameters
         ----------
@@ -316,7 +316,7 @@ class ErrorMotions:
         Raises
         ------
         ValueError
-            A straightness depends on the direction and so has two slopes, or `as_straightness` raises.
+            A straightness depends on the direction and so has two slopes, or an error as in `as_straightness`.
         """
         strokes = np.asarray(stroke_mm, dtype=np.float64)
         functions, squareness = dict(self.functions), dict.fromkeys(SQUARENESS, 0.0) | dict(self.squareness_rad)

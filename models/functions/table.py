@@ -84,7 +84,7 @@ class Table:
     def derivative(self, x_mm: ArrayLike) -> F1:
         """Return the slope per mm at positions of any shape.
 
-        At a position of a linear table it is the slope of the interval to the RIGHT; at the last position, of the one to the left.
+        At a position of a linear table this is the slope of the interval to the RIGHT; at the last position, of the interval to the left.
         """
         x, (lo, hi) = positions(x_mm), self.domain_mm
         if self._spline is None:

@@ -40,7 +40,7 @@ class Term:
 
 
 SMOOTH_ORDER = 12
-"""Highest Legendre order of a smooth error motion; higher ones describe what is rough (`rough_terms`)."""
+"""Highest Legendre order of a smooth error motion; higher orders describe its rough part (`rough_terms`)."""
 ROUGH_ORDER = 36
 """Highest Legendre order of a translational error motion with its rough part: details of a twentieth of the stroke."""
 ROUGH_ANGLE_ORDER = 24
@@ -96,7 +96,7 @@ def term_values(terms: tuple[Term, ...], axes_mm: F2, stroke_mm: F2) -> F2:
 def term_motions(terms: tuple[Term, ...], coefficients: F1, axes_mm: F2, stroke_mm: F2) -> F3:
     """Return the error motions that coefficients of terms give at commanded positions, without lever arms.
 
-    The same as the products of `term_values` with the coefficients, in a tenth of the time: the polynomials are evaluated once per axis.
+    The result equals the products of `term_values` with the coefficients, in a tenth of the time: polynomials are evaluated once per axis.
 
     Parameters
     ----------

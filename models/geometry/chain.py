@@ -162,8 +162,8 @@ def motion_jacobian(machine: Machine, axes_mm: F2, tool_mm: F1 | F2 | None = Non
 def exact_jacobian(machine: Machine, axes_mm: F2, motions: F3, tool_mm: F1 | F2 | None = None) -> F4:
     """Return the derivative of the exact deviation, with rotation vectors, with respect to each error motion, at given motions.
 
-    It is analytic: each carriage rotates the contributions of the carriages before it, and Rodrigues' formula is differentiated. At zero
-    motions it equals `motion_jacobian`.
+    The derivative is analytic: each carriage rotates the contributions of the carriages before it, and Rodrigues' formula is
+    differentiated. At zero motions it equals `motion_jacobian`.
 
     Parameters
     ----------

@@ -23,11 +23,11 @@ from abbe.models.machine import Machine, lever_masks, levers_mm
 BLOCK = 4096
 """Points in one block: 18 motions of them are 0.6 MB."""
 SHARED = 65_536
-"""Points from which on blocks are shared among the cores; below, starting threads costs more than it saves."""
+"""Number of points from which on the cores share the blocks; with fewer points, starting threads costs more than it saves."""
 CORES = 2
 """Number of threads for many points. More would only wait for memory; on a single core the second costs little."""
 LEAST = 512
-"""Points from which on it is worth looking whether they are a grid."""
+"""Number of points from which on it is worth testing whether they form a grid."""
 TILE = (32, 1000)
 """Rows and columns of one product: times 8, fewer than the 2**18 multiplications from which on OpenBLAS starts threads of its own."""
 
@@ -42,14 +42,14 @@ def field_mm(machine: Machine, motions: Motions, axes_mm: F2) -> F2:
     ----------
     motions : function
         Error motions at positions, shape (n, 3) -> (n, 3 axes, 6), mm and rad, squareness included. The motions of an axis must depend on
-        the position of this axis only, and several threads may call it at once.
+        the position of this axis only, and several threads may call the function at once.
     axes_mm : array, shape (n, 3)
         Commanded positions. A full grid, X slowest, is recognised.
 
     Returns
     -------
     array, shape (n, 3)
-        Actual minus nominal, tool relative to workpiece, mm. Both ways agree to rounding, about 1e-15 mm.
+        Actual minus nominal, tool relative to workpiece, mm. Grid and blocks agree to rounding, about 1e-15 mm.
 
     Raises
     ------
@@ -69,9 +69,9 @@ def field_mm(machine: Machine, motions: Motions, axes_mm: F2) -> F2:
 
 
 def in_blocks(count: int, work: Callable[[slice], None], *, weight: int = 1) -> None:
-    """Call ``work`` for slices that cover ``count`` rows, in any order; by several threads if they are many.
+    """Call ``work`` for slices that cover ``count`` rows, in any order; several threads do it if there are many rows.
 
-    ``weight``: points in one row. A slice holds `BLOCK` points or, where a row is more, one row.
+    ``weight``: points in one row. A slice has `BLOCK` points or, if a row has more, one row.
     """
     size = max(1, BLOCK // weight)
     blocks = [slice(start, min(start + size, count)) for start in range(0, count, size)]
@@ -161,7 +161,7 @@ def grid_mm(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> F4:
 
 
 def _own(machine: Machine, axis: int, line_mm: F1, motions: F2) -> F2:
-    """Return what a carriage adds that depends on its own position alone, shape (n, 3): translation, and rotation of its constant arm."""
+    """Return the part of a carriage that depends only on its own position, shape (n, 3): translation, and rotation of its constant arm."""
     at = np.zeros((line_mm.size, 3))
     at[:, axis] = line_mm
     return np.asarray(motions[:, :3] + cross(motions[:, 3:], levers_mm(machine, at)[:, axis]))

@@ -151,7 +151,7 @@ def deviation_covariance(
     Raises
     ------
     ValueError
-        The matrix does not fit the names or is not a covariance (`checked_covariance`), or `sensitivity` would raise.
+        The matrix does not fit the names or is not a covariance (`checked_covariance`), or an error as in `sensitivity`.
     """
     names, matrix = covariance
     matrix = checked_covariance(matrix, len(names))

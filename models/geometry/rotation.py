@@ -98,7 +98,7 @@ def turn_vector(rotation_rad: F2, v_mm: F2) -> F2:
 
 
 def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
-    """Return (R − I) v for R = Rz(EC) Ry(EB) Rx(EA); with ``reverse``, R = Rx(EA) Ry(EB) Rz(EC), the inverse of the same for −E.
+    """Return (R − I) v for R = Rz(EC) Ry(EB) Rx(EA); with ``reverse``, for R = Rx(EA) Ry(EB) Rz(EC), the inverse of the first R for −E.
 
     Shapes are those of `turn_vector`.
     """

@@ -82,8 +82,8 @@ def pahk_machine(kind: PahkType, stroke_mm: F2, probe_offset_mm: F1 | None = Non
 def parameter_signs(kind: PahkType) -> F2:
     """Return the signs that turn Pahk's functions of an axis into ISO motions and back, shape (3 axes, 6: dx dy dz Ex Ey Ez).
 
-    They are +1 on the tool side. On the workpiece side Pahk states the table's own motion: lateral d and all E change sign, the d along the
-    axis does not.
+    The signs are +1 on the tool side. On the workpiece side Pahk states the table's own motion: lateral d and all E change sign, the d
+    along the axis does not.
     """
     signs = np.ones((3, 6))
     for j in np.flatnonzero(kind.work_side):

@@ -19,7 +19,7 @@ from abbe.models.solvers.observe import LOST, run_design, setup_unknowns
 def plane_uncertainty_mm(what: PlanningProblem, runs: tuple[RunData, ...], points_mm: F2, noise_mm: float) -> tuple[float, float]:
     """Return the standard uncertainty of the deviation in X and Y at points in a plane: at the worst point, and rms, mm.
 
-    The best-fit rigid motion in the plane is removed. ``runs``: poses, and calibrated lengths of the artefact; ``noise_mm``: of a reading.
+    The best-fit rigid motion in the plane is removed. ``runs``: poses, and calibrated lengths of the artefact; ``noise_mm``: per reading.
     """
     n_terms = len(what.terms)
     setup = setup_unknowns(runs, what.priors, what.machine)

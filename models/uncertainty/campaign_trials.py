@@ -33,7 +33,7 @@ EXACT_ROUNDS = 4
 MOST_POINTS = 500
 """Most points of one set of trials: a batch of 10^4 results then takes 120 MB, and so does each copy for sorting and moments."""
 CHUNK_READINGS = 4_000_000
-"""Simulated readings held at once: 16 MB."""
+"""Number of simulated readings in memory at once: 16 MB."""
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Stated inputs of an uncertainty budget beside the campaign's data; each default is an ASSUMPTION.
+"""Stated inputs of an uncertainty budget, in addition to the campaign's data; each default is an ASSUMPTION.
 
 The solution of a campaign includes the noise of its readings and the priors of its set-ups, but not temperatures or errors that its smooth
 model cannot follow. Those are stated here, and the budget marks them as stated.

@@ -20,7 +20,7 @@ from abbe.models.geometry.volume import RigidFree, rigid_at, rigid_fit
 from abbe.models.machine import Machine
 
 SHORTEST = 4
-"""Least number of positions of each line: the table of the two other lines must stay small beside the results."""
+"""Least number of positions of each line: the table of the two other lines must stay small compared with the results."""
 Take = Callable[[slice, F4], None]
 
 

@@ -185,7 +185,7 @@ def predict_deviation(
     Parameters
     ----------
     sources : ErrorSources
-        Of the campaign's solution (`abbe.models.uncertainty.sources.error_sources`).
+        Error sources of the campaign's solution (`abbe.models.uncertainty.sources.error_sources`).
     points_mm : array, shape (m, 3)
     tool_mm : array, shape (3,), optional
         Vector from the spindle reference to the functional point; None: the machine's own tool.
@@ -307,7 +307,7 @@ def unobserved_mm(
 ) -> F1:
     """Return the rms length of the deviation that no reading shows, if errors have typical sizes, at points (m, 3), mm, shape (m,).
 
-    ``projection``: of the coefficients, shape (terms, terms), if only a part of the map is used (`abbe.models.uncertainty.scales`).
+    ``projection``: matrix of the coefficients, shape (terms, terms), if only a part of the map is used (`abbe.models.uncertainty.scales`).
     """
     hidden = unobserved_directions(solution)
     hidden = hidden if projection is None else projection @ hidden

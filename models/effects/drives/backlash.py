@@ -24,7 +24,7 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Places
 
 WIND_UP_MM = (0.05, 0.15, 0.5, 2.0)
-"""Lengths over which screw, coupling and guide wind up before the carriage follows, mm; much shorter ones look like a step."""
+"""Lengths over which screw, coupling and guide wind up before the carriage follows, mm; much shorter lengths look like a step."""
 
 
 def lost_motion(at: Places, key: str, values: Values) -> F3:

@@ -1,4 +1,4 @@
-"""Contour lag: all axes follow late by the same time, so a circle becomes too small, more so at a higher feed."""
+"""Contour lag: all axes follow late by the same time, so a circle becomes too small, and smaller at a higher feed."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def inward(path: Path, key: str, values: Values) -> F2:
 
 
 def _off_centre(path: Path, key: str, values: Values) -> F2:
-    """Return -tau u.v for tau = 1 ms: on a path about a cup beside the nominal centre, a lag looks like a servo mismatch.
+    """Return -tau u.v for tau = 1 ms: on a path about a cup off the nominal centre, a lag looks like a servo mismatch.
 
-    ``path.look`` must be the actual direction of the bar; with the nominal one the column is zero.
+    ``path.look`` must be the actual direction of the bar; with the nominal direction the column is zero.
     """
     return np.asarray(-1e-3 * np.einsum("ni,ni->n", path.look, path.at.v_mm_s))[:, None]
 

@@ -13,7 +13,7 @@ from abbe.models.effects.path import Path, Places
 
 LOW_MM, HIGH_MM, PER_MM = 4.0, 30.0, 0.0024
 """Bounds of the pitch, mm, and spacing of the search's start values in wave number, 1/mm: over 300 mm neighbours differ by less than one
-period, so the search converges from the nearer one."""
+period, so the search converges from the nearer neighbour."""
 STARTS = tuple(float(1.0 / k) for k in np.arange(1.0 / HIGH_MM, 1.0 / LOW_MM + PER_MM, PER_MM) if 1.0 / k >= LOW_MM)
 
 
@@ -49,7 +49,7 @@ def _modulated(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _modulated_twice(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return the wave, strongest in the middle or at the ends of the screw; the strength remains the mean amplitude where tests go."""
+    """Return the wave, strongest in the middle or at the ends of the screw; the strength remains the mean amplitude where tests move."""
     x = _along(path, at, key)
     return along(axis_of(key), *((x**2 - VISITED) * wave for wave in _waves(at, key, values, 1)))
 
@@ -91,4 +91,4 @@ SECOND = replace(
     beside=("cyclic_error",),
     variant_of="cyclic_error",
 )
-"""A second pitch of the same axis, such as that of an encoder beside that of its screw."""
+"""Error with a second pitch of the same axis, such as that of an encoder in addition to that of the screw."""

@@ -24,7 +24,7 @@ def _acceleration(at: Places, key: str, values: Values) -> F3:
 
 
 def _saturated(at: Places, key: str, values: Values) -> F3:
-    """Return the error by a delay that grows with the speed, 1 ms per 100 mm/s, and is zero at `USUAL_MM_S`."""
+    """Return the error by a delay that is zero at `USUAL_MM_S` and grows with the speed, by 1 ms per 100 mm/s."""
     a = axis_of(key)
     v = at.v_mm_s[:, a]
     return along(a, -MS * v * (abs(v) - USUAL_MM_S) / 100.0)

@@ -18,7 +18,7 @@ def swinging(path: Path, key: str, values: Values) -> F2:
 def line(paths: tuple[Path, ...], key: str, f_hz: float) -> list[F2]:
     """Return sine and cosine columns of one frequency along the axis, 1 um, separate for every ball-bar run, whose phases are unknown.
 
-    A search over frequencies uses them as the mean signal of a steady vibration: shape (n, 2 runs) per path, runs in order of their labels.
+    A search over frequencies uses these columns as the mean signal of a steady vibration: shape (n, 2 runs) per path, runs by label.
     """
     a, place = axis_of(key), order_of(path.label for path in paths if path.kind == "bar")
     out = []

@@ -1,4 +1,4 @@
-"""Angular error: a carriage turns as it moves, and its lever arm to the tool makes this a deviation."""
+"""Angular error: a carriage turns as it moves, and the lever arm to the tool makes this rotation a deviation of the tool."""
 
 from __future__ import annotations
 

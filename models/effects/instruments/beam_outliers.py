@@ -13,7 +13,7 @@ from abbe.models.effects.path import Path
 
 
 def struck(path: Path, key: str, values: Values) -> F2:
-    """Return the extra variance of every laser reading, 1 um^2; the share of readings that are outliers does not enter."""
+    """Return the extra variance of every laser reading, 1 um^2, which does not depend on the share of outliers."""
     return np.full((path.n, 1), UM**2)
 
 

@@ -18,7 +18,7 @@ def scaled(path: Path) -> F2:
 def strength(coefficients: F1, values: Values) -> float:
     """Return the misalignment in mrad from the mean coefficient of the set-ups; negative if the laser reads short.
 
-    The tilt of the mirror enters a coefficient with either sign.
+    The mirror's tilt may contribute to a coefficient with either sign.
     """
     nonzero = coefficients[coefficients != 0.0]
     mean = float(nonzero.mean()) if nonzero.size else 0.0

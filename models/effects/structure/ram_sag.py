@@ -1,4 +1,4 @@
-"""Sag of a horizontal ram: its end sinks and tilts down, the more the farther it reaches out."""
+"""Sag of a horizontal ram: its end sinks and tilts down more with a longer reach."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ SHAPE = (
 
 
 def ram_axis(path: Path) -> int | None:
-    """Return the horizontal axis that carries the tool; None if the last carriage is vertical or there is none on the tool side."""
+    """Return the horizontal axis that carries the tool; None if the last carriage is vertical or the tool side has no carriage."""
     tool_side = split_chain(path.machine.chain)[1]
     return tool_side[-1] if tool_side and tool_side[-1] != path.vertical else None
 
@@ -60,7 +60,7 @@ def sag(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
 
 
 def _bent(path: Path, at: Places, key: str, values: Values) -> tuple[F3, F3]:
-    """Return sags with another bending curve and with another growth with the height."""
+    """Return two more sags: one with another bending curve, one with another growth with the height."""
     z, length, y = _reach(path, at)
     return _sagging(path, (z**3 * y, 3.0 * z**2 / length * y), (z**2 * y**2, 2.0 * z / length * y**2))
 

@@ -33,7 +33,7 @@ def _second_time(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _uneven(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return the growth, not proportional to the distance, of a screw that is hotter where the nut works."""
+    """Return the growth of a screw that is hotter where the nut works; this growth is not proportional to the distance."""
     a = axis_of(key)
     low, high = (float(v) for v in path.machine.stroke_mm[a])
     x = (at.q_mm[:, a] - low) / (high - low)

@@ -14,7 +14,7 @@ from abbe.models.paths import DIAGONALS, diagonal_ends, step_diagonal, straight_
 from abbe.models.solvers.designs import Field, laser_rows, stacked
 
 Deviation = Callable[[F2], F2]
-"""From commanded positions (n, 3), mm, to the machine's deviation (n, 3), mm."""
+"""Maps commanded positions (n, 3), mm, to the machine's deviation (n, 3), mm."""
 
 
 @dataclass(frozen=True)

@@ -17,7 +17,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.probability import t_quantile
 
 Model = Callable[[F2], F2]
-"""From positions (n, 3), mm, to errors (n, 3), mm."""
+"""Maps positions (n, 3), mm, to errors (n, 3), mm."""
 Law = Literal["student", "normal"]
 PRINTED_NORMAL = 1.96
 """Factor behind the printed intervals of Table 1."""
