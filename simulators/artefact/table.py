@@ -1,4 +1,4 @@
-"""Artefact on the table: a plate that the probe in the spindle can touch, once the fixture has mounted both; and a sphere beside it."""
+"""Artefact on the table: a plate, and a sphere next to it, that the probe in the spindle can touch after the fixture has mounted them."""
 
 from collections.abc import Callable
 from dataclasses import replace
