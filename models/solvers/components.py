@@ -338,7 +338,9 @@ def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> t
     The prior is wider in two ways, neither of which matters with many readings. ``share``: share of the first that counts.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
-      that the readings hardly separate, the most probable sizes are too small. Without information the limit is the documented variance.
+      that the readings hardly separate, the most probable sizes are too small. Without information the limit is the documented variance; on
+      a machine whose own size is estimated (artefacts) as m times the usual one, the limit of the standard deviation is m^2 times the
+      documented one. The larger the machine, the less the documented sizes tell of motions that its readings do not show.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("smoothness ") for name in model.names])
@@ -349,8 +351,9 @@ def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> t
     sizes = model.design * ~rough
     unsure = np.einsum("ij,jk,ik->i", sizes, found.spread[: rough.size, : rough.size], sizes)
     factor = np.ones(model.typical.size)
+    documented = max(float(np.exp(c.psi[model.names.index("machine")])), 1.0) if "machine" in model.names else 1.0
     for at in model.blocks:
-        scale = np.minimum(np.exp(0.25 * share * unsure[at]), np.maximum(1.0 / c.half(model)[at], 1.0))
+        scale = np.minimum(np.exp(0.25 * share * unsure[at]), np.maximum(documented / c.half(model)[at], 1.0))
         prior_size = np.linalg.norm(model.root[:, at], axis=0) * c.half(model)[at] * scale
         factor[at] = scale * np.hypot(prior_size, SMALLEST_BEND) / prior_size
     return replace(model, root=model.root * factor), c

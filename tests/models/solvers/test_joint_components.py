@@ -82,6 +82,18 @@ def test_sizes_that_are_known_badly_widen_the_prior_and_no_shape_is_held_to_nano
     assert (part[large] < unknown[large]).all()
 
 
+@pytest.mark.parametrize(("times", "most"), [(0.5, 1.0), (1.0, 1.0), (1.5, 2.25)])
+def test_on_a_large_machine_motions_of_unknown_size_may_exceed_the_documented_one_by_its_square(times, most):
+    """``most``: prior of the motions in units of the documented one where nothing is known of their sizes; half of it is most probable."""
+    model = size_model(MACHINE, smooth_terms(6), (), np.ones(0), Priors(pooled=True))
+    size = {"machine": 2.0 * np.log(times)} | dict.fromkeys(("positioning", "straightness", "angle"), 2.0 * np.log(0.5 / times))
+    at = np.concatenate(model.blocks)
+    c = Components(np.array([size.get(name, 0.0) for name in model.names]), np.zeros(2))
+    wider, c = cautious(model, FittedComponents(c, 5.0 * np.eye(model.sd.size + 2), 0.0))
+    found = np.linalg.norm(wider.root, axis=0)[at] * c.half(wider)[at] / np.linalg.norm(model.root, axis=0)[at]
+    assert np.median(found) == pytest.approx(most, rel=0.02)
+
+
 def test_an_error_motion_is_at_most_twice_as_large_at_the_ends_as_in_the_middle():
     shapes, variance = smooth_shapes(12, 0.25)
     u = np.linspace(-1.0, 1.0, 21)
