@@ -312,8 +312,7 @@ def sqlite_base(database: Path) -> str:
 
 
 def _sqlite_files_base(store: Store | None, database: Path) -> str:
-    """Return the path of `sqlite_base`, or an earlier version's path in a shared folder if the key there sealed this database's last
-    record."""
+    """Return the path of `sqlite_base`, or the path of earlier versions if the key there sealed this database's last record."""
     base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
     if store is None or not folder or files_of(base)[0].exists():
         return base
