@@ -66,7 +66,7 @@ class BackupList:
     """List of a backup's content (``backup.json``).
 
     ``schema``: schema revision of the database; ``rows``: row counts of its main tables; ``segments``: number of files with samples that
-    were not yet in the database; ``files``: by path, without pieces; ``pieces``: the database, if it is not one file.
+    were not yet in the database; ``files``: all files by path, except the pieces; ``pieces``: the database, if it is not one file.
     """
 
     format: str
@@ -221,8 +221,8 @@ def back_up(
 ) -> BackupList:
     """Make a backup: the new folder ``target`` (0700, files 0600), complete or not at all. The service keeps running.
 
-    The backup holds everything that was on the disk at the call. Segments are copied first, because their samples leave them only when the
-    database has them; then the database, as it is at one instant; finally the audit's heads up to the last copied record.
+    The backup holds everything that was on the disk at the call. Segments are copied first, because a sample leaves its segment only when
+    the database has it; then the database, as it is at one instant; finally the audit's heads up to the last copied record.
 
     Parameters
     ----------
