@@ -42,9 +42,9 @@ class CampaignIssue:
 
 
 FASTEST = 0.2
-"""Smallest possible ratio of a run's duration to path length over feed: the programmed feed is the upper limit."""
+"""Smallest possible ratio of a run's duration to the duration at its feed: the programmed feed is the upper limit."""
 SLOWEST = {"ballbar": 10.0, "laser": 200.0}
-"""Largest ratio of a run's duration to path length over feed: a ball-bar run moves steadily, a laser run stops at every point."""
+"""Largest ratio of a run's duration to the duration at its feed: a ball-bar run moves steadily, a laser run stops at every point."""
 OVERLAP = 0.1
 """Largest allowed overlap of two runs as a share of the shorter one: clocks are not set to the second."""
 TIME_UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
@@ -113,7 +113,7 @@ OTHER_FEED = 0.3
 """Largest relative difference between the stated feed of a ball-bar run and the median feed from its positions and times. Beyond it the
 column is wrong."""
 AGREE, ALIKE = 0.65, 4
-"""Smallest share and number of runs of one kind that must agree in direction and sense of rotation; then the column of the other runs is
+"""Smallest share and number of runs of one kind that agree in direction and sense of rotation, so that the column of the others is
 wrong."""
 
 
@@ -340,8 +340,7 @@ def _readings(run: Run) -> list[CampaignIssue]:
 
 
 def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
-    """Return the issue of too large deviations: many mean another unit, some mean a lost beam or bar; robust weights handle single
-    outliers."""
+    """Return the issue of too large deviations: many mean another unit, some a lost beam or bar; robust weights handle single outliers."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:

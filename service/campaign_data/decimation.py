@@ -108,7 +108,7 @@ def thinned(runs: list[Run]) -> list[Run]:
 def picked(runs: list[Run], most: int) -> list[Run]:
     """Pick about ``most`` measured ball-bar readings: the middle one of every block, unchanged.
 
-    Means have less noise, but a mean over a reversal mixes both sides, and lost motion or friction well above the noise then matches no
+    Means have less noise, but a mean over a reversal mixes both sides. Lost motion or friction well above the noise then matches no
     formula. A run shorter than `FEWEST` blocks stays unchanged.
     """
     total = sum(len(r.columns) for r in runs if _measured_bar(r))

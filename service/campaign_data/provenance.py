@@ -55,8 +55,8 @@ def removals_of(runs: list[Run]) -> list[str]:
 def whole_run_digest(run: Run) -> str:
     """Return the SHA-256 of everything that a search can use of a run: label, test, role, machine, set-up and all columns.
 
-    Changed readings enter by the digest of the measured ones and descriptions of the subtracted effects, because the subtracted values may
-    differ in the last digit between computers.
+    Changed readings enter by the digest of the measured readings and by descriptions of the subtracted effects: the subtracted values
+    may differ in the last digit between computers.
     """
     out = hashlib.sha256(json.dumps([run.run_id, run.test, run.role, run.machine, run.setup.document], sort_keys=True).encode())
     if run.measured_digest:
@@ -68,13 +68,12 @@ def whole_run_digest(run: Run) -> str:
 
 
 def _bytes(values: NDArray[Any]) -> bytes:
-    """Numbers as float64, names as text."""
+    """Return the bytes of a column: numbers as float64, names as text."""
     return "\n".join(values.tolist()).encode() if values.dtype.kind == "U" else np.asarray(values, dtype="<f8").tobytes()
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another plug-in; without a file, that of its module
-    name."""
+    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another plug-in; without a file, of its module name."""
     inner = getattr(function, "func", function)  # functools.partial
     name = str(getattr(inner, "__module__", type(inner).__module__))
     file = getattr(sys.modules.get(name), "__file__", None)
