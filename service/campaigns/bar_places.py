@@ -104,7 +104,7 @@ class BarPlaces:
 
     @asynccontextmanager
     async def cleared_away(self) -> AsyncIterator[None]:
-        """Take cup and bar out after the block, or warn that they may still be mounted, because the next motion goes down to the centre."""
+        """After the block, take cup and bar out, or warn that they may still be mounted: the next motion goes down to the centre."""
         try:
             yield
         except (TableRefused, PushNotBegun, MeasurementFault) as error:  # the axes stand, and a person can reach in

@@ -83,7 +83,7 @@ class BarBreaks:
 MOST_TRIES = 5
 """Maximum number of consecutive suspensions or mountings of a test without a new point; after that a person has to look."""
 LEAST_GAIN_MM = 1.0
-"""Smallest increase of the length read of a path that counts as progress."""
+"""Smallest increase of a path's read length that counts as progress."""
 Confirm = Callable[[str], Awaitable[bool]]
 
 

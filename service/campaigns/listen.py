@@ -39,7 +39,7 @@ from abbe.service.storage.store import Store
 
 Report = Callable[[str], None]
 STATUS_EVERY = 3
-"""Laser readings per controller status."""
+"""Number of laser readings between two controller statuses."""
 QUIET = 4.0
 """Without a "program running" status, a test has ended after this many of its longest dwells without motion."""
 MOVED_MM = 0.05
@@ -123,8 +123,8 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
 
 
 async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: Report) -> None:
-    """Wait until the machine stands at the start of the test. If its position is unknown, the person who mounts the mirror there vouches
-    for it."""
+    """Wait until the machine stands at the start of the test; if its position is unknown, the person who mounts the mirror vouches for
+    it."""
     before, reported = None, False
     if not math.isfinite(sum((await session.controller.status()).position_mm)):
         return
@@ -143,7 +143,7 @@ async def _at_start(session: Session, test: TestPlan, start_mm: Point, report: R
 async def _hear(session: Session, quiet_s: float) -> Heard:
     """Read the laser from before the program moves the machine until the program has ended.
 
-    Without a "program running" status, it has ended after ``quiet_s`` seconds without motion.
+    Without a "program running" status, the program has ended after ``quiet_s`` seconds without motion.
     """
     heard, laser = Heard(), session.need_laser()
     last, ran, moved_us, level = None, False, 0, None

@@ -51,8 +51,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 
 @dataclass
 class ProgressReporter:
-    """Progress of a job in planned machine seconds. The ETA follows first from the dry run, then from the wall time per machine second so
-    far.
+    """Progress of a job in planned machine seconds. The ETA follows first from the dry run, then from the pace so far.
 
     Time spent waiting for a person (``waited_s``) does not count.
     """

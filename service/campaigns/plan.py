@@ -1,4 +1,4 @@
-"""Plans a campaign for a machine and returns it as a recipe for the sequencer, which a dry run has checked, and as a document.
+"""Plans a campaign for a machine. The result is a recipe for the sequencer, checked by a dry run, and a document.
 
 The instruments file of `abbe plan --instruments FILE.toml` gives the available bars, noise of the instruments, and duration of set-ups.
 """

@@ -180,7 +180,7 @@ class Plausibility:
 
 
 def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausibility:
-    """Check a whole machine file without connecting to anything. ``folder``: of the machine file, with the recipe files."""
+    """Check a whole machine file without connecting to anything. ``folder``: folder of the machine file and the recipe files."""
     site = site_of(config)
     rare = [*_strokes(config), *_window(config), *certificates(site, today), *_far(site, today), *_none(site)]
     return Plausibility((*_device_files(site), *unattended(config, site, folder)), tuple(rare))
