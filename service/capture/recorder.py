@@ -1,8 +1,8 @@
 """The recorder of real runs: samples go from the driver's thread to the segment, and from there to the database.
 
-Every item reaches the disk within tens of milliseconds (`CaptureLog`), in a thread of its own, which the event loop, the database or a
-solver cannot delay. The disk can: then `CaptureLog.put` waits and the ring of the driver fills, which stops the machine before a sample is
-lost.
+Every item reaches the disk within tens of milliseconds (`CaptureLog`), in a thread of its own. Neither the event loop nor the database
+nor a solver can delay this thread. The disk can: then `CaptureLog.put` waits and the ring of the driver fills, which stops the machine
+before a sample is lost.
 """
 
 from __future__ import annotations
@@ -127,7 +127,7 @@ class CaptureLog:
 
     @property
     def hangs(self) -> bool:
-        """After `close`: whether the disk has not answered, so that the state of the file is unknown."""
+        """Whether the disk did not answer during `close`, so that the state of the file is unknown."""
         return self._thread.is_alive()
 
     def _hangs(self) -> CaptureFault:
@@ -222,7 +222,7 @@ class CaptureLog:
 
     @property
     def gaps(self) -> list[SampleGap]:
-        """Gaps so far."""
+        """Gaps in the samples so far."""
         return list(self.drafter.ledger.gaps)
 
 
@@ -297,7 +297,7 @@ class CaptureRecorder:
         self.check()
 
     def check(self) -> None:
-        """Raise an error of the threads.
+        """Raise the error of a thread, if there is one.
 
         Raises
         ------

@@ -1,7 +1,7 @@
 """The append-only file of one run: records chained by their hashes, on the disk when `append` returns.
 
-The module also holds the file operations as a port (`FileIO`), so that tests can make each of them fail or stop, the encoding of
-records, the reserve of disk space for closing a run on a full disk, and the scan that finds the valid part of a file.
+The module also holds the file operations as a port (`FileIO`), which tests can make fail or stop; the encoding of records; the reserve
+of disk space for closing a run on a full disk; and the scan that finds the valid part of a file.
 """
 
 from __future__ import annotations
