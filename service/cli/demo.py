@@ -146,8 +146,7 @@ def _folder(keep: Path | None) -> Path:
 
 @contextmanager
 def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
-    """Yield the folder for database and device links: ``folder``, or without it a temporary folder. ``folder`` must hold no other
-    demonstration."""
+    """Yield the folder for database and device links: ``folder``, which must hold no other demonstration; without it a temporary folder."""
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)

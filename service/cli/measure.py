@@ -446,7 +446,7 @@ class Rehearsal:
 
 
 def dry_run_doc(plan: CampaignPlan, runs: tuple[DryRun, ...], *, every: bool) -> dict[str, Any]:
-    """Return the dry run for programs: one object per test; ``every``: with each commanded position, mm."""
+    """Return the dry run for programs: one object per test; ``every``: include each commanded position, mm."""
     from abbe.service.domain.document import document
     from abbe.service.sequences.check import positions
 

@@ -161,8 +161,7 @@ def _import_contents(
 
 
 def _columns(path: Path, columns: Path | None) -> ColumnFile | None:
-    """Return the column file of a table: the given one, the one kept beside the table, or one made by questions at the terminal; else
-    None."""
+    """Return the column file of a table: the given one, the one beside the table, or one made by questions at the terminal; else None."""
     from abbe.service.instrument_files.columns import column_file, toml_of
     from abbe.service.instrument_files.registry import is_table
 
