@@ -172,7 +172,7 @@ async def while_moving(t: Trial, site: Site) -> None:
 
 
 async def _on_the_way(t: Trial, target: Point) -> str:
-    """Move slowly and attempt an activation meanwhile; return why this showed nothing, or an empty text if it showed something."""
+    """Move slowly and attempt an activation meanwhile; return the reason why the attempt showed nothing, empty if it showed something."""
     now = await t.seal_copy()
     move = asyncio.ensure_future(t.controller.move(target, feed_mm_min=FEED_MM_MIN, timeout_s=MOVE_LIMIT_S))
     try:

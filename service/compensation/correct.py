@@ -182,7 +182,7 @@ def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
 
 @dataclass
 class _PushQuestions:
-    """Answers the push machine's questions on one proposal: what speaks against it, and the results of sign probe and verification."""
+    """Answers the push machine's questions on one proposal: the reasons against it, and the results of sign probe and verification."""
 
     context: PushContext
     admission: Admission

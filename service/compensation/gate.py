@@ -185,7 +185,7 @@ class PushContext:
 class Admission:
     """The token that a push needs: a proposal with no reason against it, and the readings and decisions that prove this.
 
-    ``level``: of the control (`abbe.service.push.journal`). ``hint``: a warning about the control for people, or empty.
+    ``level``: proved level of the control (`abbe.service.push.journal`). ``hint``: a warning about the control for people, or empty.
     """
 
     precheck: PushPrecheck

@@ -1,8 +1,8 @@
 """From an identification campaign to a stored proposal: solve the runs, add the tables in force, collect the reasons against it.
 
 A machine that is measured with a table active shows the errors that this table leaves. Therefore the active table is read from the
-controller, every run must have been measured with it, and the new table is the old one plus the errors that the runs still show. Nothing
-is written to the controller.
+controller, and every run must have been measured with it. The new table is the active one plus the errors that the runs still show.
+Nothing is written to the controller.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ class Promise:
 
 
 def candidate_of(site: Site, promise: Promise, base: Base, runs: list[Run], form: TableFormat) -> Candidate:
-    """Make a signed candidate of computed tables; ``runs``: those that were solved."""
+    """Make a signed candidate of computed tables; ``runs``: the solved runs."""
     columns = tuple(_column(promise, a, i) for a in range(3) for i in range(3))
     blank = Candidate(site.name, FORMAT_VERSION, form.lsb_nm, "mm", columns, base.crc, _evidence(site, promise, runs), "")
     digest = content_digest(blank)
@@ -326,7 +326,7 @@ def _change_where_touched(solved: Solved) -> tuple[NineTables, Predicted, tuple[
 
 
 async def solve_again(store: Store, site: Site, campaign: str, table: NineTables | None) -> Solved:
-    """Solve a stored proposal's campaign again, to compare the solution with a newer run. ``table``: in force during the campaign."""
+    """Solve a stored proposal's campaign again, to compare it with a newer run. ``table``: the table in force during the campaign."""
     known = await asyncio.to_thread(_campaign_without_known_effects, store, campaign, table)
     return await asyncio.to_thread(solve_runs, site, known.campaign.runs)
 

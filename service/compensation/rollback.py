@@ -152,7 +152,7 @@ def check_known(journal: JournalView, base: Base) -> None:
     Raises
     ------
     TableMismatch
-        The table in force is neither a known one nor one that a person accepted.
+        The table in force is neither known nor accepted by a person.
     """
     accepted = {facts((e,)).accepted_crc for e in journal.entries if e.state is PushState.ACCEPTED}
     if base.image not in known_images(journal) and crc32(base.image) not in accepted:
