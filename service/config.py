@@ -130,7 +130,7 @@ def _read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
 
 
 def _text(body: bytes) -> str:
-    """The text of a file, each line with one end. Raises UnicodeDecodeError."""
+    """Return the text of a file with line feeds as its only line ends. Raises UnicodeDecodeError."""
     return body.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
 
 
@@ -153,7 +153,7 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """Each header, key with its value, comment or empty line, with the number of its first line."""
+    """Yield each header, each key with its value, each comment and each empty line, with the number of its first line."""
     line, begun, start, depth = 1, 1, 0, 0
     for token in _TOKEN.finditer(text):
         found = token[0]
