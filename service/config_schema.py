@@ -47,7 +47,7 @@ Coefficient = Annotated[float, Field(ge=-1e-5, le=1e-4)]
 CoefficientUncertainty = Annotated[float, Field(gt=0.0, le=1e-5)]
 Temperatures = Annotated[Interval, AfterValidator(_celsius)]
 ROOM_K = 1.0
-"""Widest range of a stated room: `abbe.service.verification.verify.SAME_AIR_C`."""
+"""Largest stated range of a room's temperature, K; the same as `abbe.service.verification.verify.SAME_AIR_C`."""
 MachineWindow = Annotated[Window, AfterValidator(complete)]
 EXCLUSIVE_KEYS = {
     "schedule": (("cron",), ("every_h", "first")),
@@ -280,7 +280,7 @@ class Calibration(ConfigTable):
         return self
 
     def until(self) -> dict[str, date]:
-        """Last days of the certificates that are stated, by instrument (`abbe.service.domain.run.Run.instrument`), and of the room."""
+        """Stated last days of the certificates by instrument (`abbe.service.domain.run.Run.instrument`), and of the room's temperature."""
         days = {"ballbar": self.ballbar, "laser": self.laser, "artefact": self.artefact, "room": self.room}
         return {kind: day for kind, day in days.items() if day is not None}
 
