@@ -145,7 +145,7 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
 
 
 async def push_is_open(store: Store, machine: str, control: str = "") -> bool:
-    """Return whether the last push into a control is under way, waits for its rollback, or needs a person: by its journal alone.
+    """Return whether the journal shows that the last push into a control is under way, waits for its rollback, or needs a person.
 
     Raises
     ------

@@ -93,8 +93,7 @@ AGAIN_S = 1.0
 """Time after which a first difference is checked again, s: another process's push may have ended between two readings."""
 CODE = STRANGE_TABLE_CODE
 REMEDY = "find out who wrote it; restore the right table, or have this one accepted if it is right (abbe accept-table -m MACHINE.toml)"
-"""Remedy for an unknown table. Rollback and push are no remedy: they are refused while the table is active
-(`abbe.service.tables.table_gate`)."""
+"""Remedy for an unknown table. Rollback and push are refused while the table is active (`abbe.service.tables.table_gate`)."""
 
 
 class TableWatch:
