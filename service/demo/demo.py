@@ -112,7 +112,7 @@ def write_machine_file(site: Site, folder: Path) -> Path:
 
 
 def machine_file_of(site: Site, *, verify: bool = True) -> str:
-    """Return the text of the machine file of a simulated machine; ``verify``: with limits of a check."""
+    """Return the text of the machine file of a simulated machine; ``verify``: include the limits of a check."""
     return machine_text(site.doc, site.urls, site.calibrated_until, site.limits, verify=verify)
 
 

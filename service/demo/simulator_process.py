@@ -80,8 +80,8 @@ class HiddenTruth:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class SealedTruth:
-    """True errors of a simulated machine without rigid motion, µm: vectors at the points of a grid; ``plane_rms_um``: in the plane of an
-    artefact."""
+    """True errors of a simulated machine without rigid motion, µm: vectors at the points of a grid; ``plane_rms_um``: rms in the plane
+    of an artefact."""
 
     max_body_diagonal_um: float
     volumetric_rms_um: float
