@@ -236,7 +236,7 @@ def latest_reading(meter: DisplacementMeter) -> LaserReading | None:
 
 
 def notes_since(controller: Controller, ctrl_us: int) -> list[list[float]]:
-    """Return pairs [controller us, host s] since a controller time; if more than 500, the least delayed of each of 500 groups."""
+    """Return pairs [controller us, host s] since a controller time. More than 500 are thinned to 500: the least delayed of each group."""
     if not isinstance(controller, _Noted):
         return []
     pairs = [(float(c), h) for c, h in controller.clock_notes if c >= ctrl_us]
