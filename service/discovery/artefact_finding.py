@@ -14,7 +14,7 @@ from abbe.service.identification.solve import Solved, solve_runs
 
 FORMAT = "abbe-artefact-finding/1"
 LEFT = 2.0
-"""Points that scatter by more than this factor of their repeatability hold something that neither part nor machine explains."""
+"""Points that scatter by more than this factor of their repeatability have an error that neither part nor machine explains."""
 
 
 @dataclass(frozen=True, eq=False)

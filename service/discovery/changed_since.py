@@ -62,8 +62,7 @@ class _Before:
 def reference_solution(store: Store, campaign: Campaign) -> ReferenceSolution | None:
     """Return the last comparable solution of the same machine from an earlier stored campaign; None if there is none.
 
-    The solution must be for the same geometry and contain its covariance. The compensation tables of both measurements must be known or
-    equal.
+    The solution must have the same geometry and a covariance. The compensation tables of both measurements must be known or equal.
     """
     for record in _earlier(store, campaign):
         try:

@@ -1,7 +1,7 @@
 """The discovery workflow: fit, suspect, propose, test, explain or leave unexplained. It is stored and resumes where it was stopped.
 
 The search itself is one pure computation that takes seconds (`abbe.models.discovery.discover`). The journal stores the finding with the
-first state that follows from it, so that nothing is computed twice, and the new model version with the last state.
+first state that follows from it, so that nothing is computed twice. It stores the new model version with the last state.
 """
 
 from __future__ import annotations

@@ -29,8 +29,8 @@ CLOSED = 0.5
 SOME = 0.2
 """Smallest closed share of the gap that counts: a smaller share also closes by chance."""
 LEFT = 1.5
-"""Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller gap may also be the prediction's own
-error, so it does not refute an effect with which the holdout runs agree better."""
+"""Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller rest may be an error of the
+prediction, so it does not refute an effect that makes the holdout runs agree better."""
 FELT = 0.01
 """Smallest relative change of the rms of the holdout runs, with and without one effect, at which these runs can judge it."""
 WORSE = 1.05

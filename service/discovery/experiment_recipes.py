@@ -163,8 +163,7 @@ def _repeats(like: Helix, name: str) -> list[Recipe]:
 
 
 def _first_helix(machine: Machine, runs: list[Run]) -> Helix | None:
-    """Return the first helix as a recipe, None if it cannot be repeated; if no helix was measured, return the helix that verifies
-    tables."""
+    """Return the first helix as a recipe, None if it cannot be repeated; without any helix, return the helix that verifies tables."""
     for run in runs:
         if run.test == "ballbar_helix":
             return _recipe_of(machine, run)

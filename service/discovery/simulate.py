@@ -26,9 +26,9 @@ AGREE = 1.1
 class Simulation:
     """Predicted readings of every run and their residuals.
 
-    ``predicted_mm``: by run label, sealed runs included, as the instrument would read; ``residual_mm``: measured minus predicted, after
+    ``predicted_mm``: readings of the instrument by run label, sealed runs included; ``residual_mm``: measured minus predicted, after
     fitting each run's own set-up values (the zero of a laser run, cup and bar length of a set-up without a fitted run), NaN where the
-    instrument flagged the reading; ``noise_mm``: of one reading, by instrument.
+    instrument flagged the reading; ``noise_mm``: noise of one reading, by instrument.
     """
 
     predicted_mm: dict[str, F1]
