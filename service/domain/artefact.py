@@ -39,7 +39,7 @@ class PoseObject(FileObject):
 
 
 class Feature(FileObject):
-    """One hole, ball or wall: nominal place, sensed axes of the artefact, for a wall its outward normal, and for probing its radius."""
+    """One hole, ball or wall: nominal place and sensed axes of the artefact; for a wall, its outward normal; for probing, its radius."""
 
     id: Name
     nominal_mm: Point
@@ -84,7 +84,7 @@ class QualificationSphere(FileObject):
 
 
 class ArtefactObject(FileObject):
-    """A plate, bar or workpiece with its features and known lengths; ``obstacles``: what else lies there."""
+    """A plate, bar or workpiece with its features and known lengths; ``obstacles``: other objects beside them."""
 
     kind: str
     features: list[Feature]

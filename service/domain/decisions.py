@@ -20,7 +20,7 @@ class ProposalRecord(DocumentRow):
 class ProposalDecision:
     """A person's decision on a proposal. Never changed after writing; the database gives ``id`` and ``utc``.
 
-    ``name``: as the person gave it; ``login``: the account.
+    ``name``: the name that the person gave; ``login``: the account.
     """
 
     id: int = 0

@@ -65,7 +65,7 @@ class FoundLocation(FileObject):
 
 
 class FoundTest(FileObject):
-    """Next measurement."""
+    """The next measurement that the search proposes."""
 
     adds: list[Adds]
     plan: dict[str, object] | None = None
@@ -118,8 +118,8 @@ class DiscoveryFile(FileObject):
     """Effects that a campaign's simulation lacks, and the predictions of sealed runs, mm.
 
     ``effects``: named effects that are claimed. ``suspects``: names that fit the fitted runs but that the judging runs do not confirm;
-    then the verdict is "unknown". ``proved``: whether the judging runs confirm the effects; ``proof``: by which rule, or why they cannot
-    judge.
+    then the verdict is "unknown". ``proved``: whether the judging runs confirm the effects; ``proof``: the rule of this judgement, or
+    why they cannot judge.
     """
 
     format: Literal["abbe-discovery/1"]
@@ -195,7 +195,8 @@ class StandstillFile(FileObject):
     """The part of a machine's displacement at standstill that temperatures explain (ISO 230-3).
 
     ``runs``: fitted runs in order of time. ``covered``: share of readings within U (k = 2) in runs left out. ``model``: the better
-    predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: of runs that were not fitted.
+    predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: predicted runs, which were not
+    fitted.
     """
 
     format: Literal["abbe-standstill/1"]

@@ -125,9 +125,9 @@ class RivalEffect:
 class EffectSize:
     """An effect with its size and its catalogue entry; findings and model books share it.
 
-    ``coefficients``, ``covariance``: of the effect's linear columns, in their units. ``forms``: names of the extra shape terms that it
-    needed. ``needed``: rms of the judging runs without this effect, divided by their rms with it; None if no run judges. ``evidence``:
-    gain in log evidence (natural logarithm), less the price of an additional effect.
+    ``coefficients``, ``covariance``: values for the effect's linear columns, in their units. ``forms``: names of the extra shape terms
+    that it needed. ``needed``: rms of the judging runs without this effect, divided by their rms with it; None if no run judges.
+    ``evidence``: gain in log evidence (natural logarithm), less the price of an additional effect.
     """
 
     label: str
@@ -208,8 +208,8 @@ class ChangeRival:
 class MotionChange:
     """An error motion that has changed. ``part``: linear (scale, squareness), or the shape, whose rms over the stroke is the value.
 
-    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: in how many halves of the
-    runs (0 to 2) a separate search finds it.
+    ``u``: standard uncertainty; ``rivals``: changes that these runs cannot distinguish from it; ``halves``: number of halves of the runs
+    (0 to 2) in which a separate search finds the change.
     """
 
     motion: str

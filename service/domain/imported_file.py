@@ -12,7 +12,7 @@ from abbe.service.domain.machine import FileObject
 class SourceFile(FileObject):
     """One file that was imported.
 
-    ``sha256``: of its bytes; ``said``: the facts that it states, as text; ``unknown``: facts that neither file nor answers state.
+    ``sha256``: digest of its bytes; ``said``: the facts that it states, as text; ``unknown``: facts that neither file nor answers state.
     """
 
     file: str

@@ -147,8 +147,8 @@ class AxisMaterial:
     """Section ``[material]`` of the machine file for one axis; None: not stated. Every ``u_`` is a standard uncertainty.
 
     ``scale_per_k``, ``laser_per_k``: expansion coefficients of the scale and of the laser's own compensation (0: off), 1/K;
-    ``temperature_c``: of the scale, °C, for runs that did not record it; ``u_temperature_k``: of the recorded or stated one, K.
-    ``workpiece_per_k``: expansion coefficient of the workpieces, 1/K, the same for all axes.
+    ``temperature_c``: temperature of the scale, °C, for runs that did not record it; ``u_temperature_k``: uncertainty of the recorded or
+    stated temperature, K. ``workpiece_per_k``: expansion coefficient of the workpieces, 1/K, the same for all axes.
     """
 
     scale_per_k: float | None

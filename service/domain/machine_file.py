@@ -28,7 +28,7 @@ class StatedValue:
 
 @dataclass(frozen=True, slots=True)
 class MachineFileSummary:
-    """The machine file as the service read it at its start. ``sha256``: of the file; ``left_out``: number of values that ``values``
+    """The machine file as the service read it at its start. ``sha256``: digest of the file; ``left_out``: number of values that ``values``
     lacks."""
 
     path: Text

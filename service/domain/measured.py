@@ -125,10 +125,11 @@ class BarRecord(StandstillRecord):
 class TouchedFeature:
     """The touches of a hole (``inside``) or ball.
 
-    ``nominal_mm``: in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from the centre to each
-    touch, machine axes; ``touches_mm``: for each side the repeated latched axis positions; ``start_deg``: direction of the first touch;
-    ``resolution_mm``: travel between two readings of the probe input by the control, 0: none; ``radius_mm``: distance of the tip's centre
-    from it that was expected; ``u_sphere_mm``: standard uncertainty of the radius of a qualification sphere, None: a feature.
+    ``nominal_mm``: nominal place in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from
+    the centre to each touch, machine axes; ``touches_mm``: for each side the repeated latched axis positions; ``start_deg``: direction
+    of the first touch; ``resolution_mm``: travel between two readings of the probe input by the control, 0: none; ``radius_mm``:
+    expected distance of the tip's centre from the feature's centre; ``u_sphere_mm``: standard uncertainty of the radius of a
+    qualification sphere, None: a feature.
     """
 
     feature: str
@@ -146,12 +147,12 @@ class TouchedFeature:
 
     @property
     def qualifies(self) -> bool:
-        """Whether it is the qualification sphere."""
+        """Whether these are touches of the qualification sphere."""
         return self.u_sphere_mm is not None
 
     @property
     def what(self) -> str:
-        """What it is, for people."""
+        """Name of what was touched, for people."""
         return touched_name(self.feature, qualifies=self.qualifies)
 
 
@@ -439,7 +440,7 @@ class RunFacts:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunRecord(RunFacts):
-    """One measured sequence. ``status``: as written; ``visible_status``: as people see it."""
+    """One measured sequence. ``status``: the written status; ``visible_status``: the status that people see."""
 
     id: int
     campaign_id: int

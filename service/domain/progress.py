@@ -81,8 +81,9 @@ class RecordedPath:
 class MachineReading:
     """The machine during a measurement, from answers that the measurement asked for. None: not known.
 
-    ``at_ms``: when the controller answered, UTC milliseconds; ``position_mm``: of the axes; ``feed_mm_min``: along the chord between two
-    positions; ``air_c``: air temperature at the laser; ``laser_mm``: count of the laser at ``laser_at_ms``, valid only while ``beam_good``.
+    ``at_ms``: when the controller answered, UTC milliseconds; ``position_mm``: position of the axes; ``feed_mm_min``: feed along the
+    chord between two positions; ``air_c``: air temperature at the laser; ``laser_mm``: count of the laser at ``laser_at_ms``, valid only
+    while ``beam_good``.
     """
 
     at_ms: float

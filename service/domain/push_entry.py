@@ -1,4 +1,4 @@
-"""States of a push, their transitions, and the journal entry of one transition, on disk before the operation that it permits is done."""
+"""States of a push, their transitions, and the journal entry of a transition. An entry is on disk before the operation that it permits."""
 
 from __future__ import annotations
 
@@ -83,8 +83,8 @@ class PushTransition:
     """One transition of one push, chained by ``prev`` to the entry before it in the same journal.
 
     ``number``: given by the database; ``machine``: name of the journal (`abbe.service.storage.repositories.results.chain_of`); ``push``:
-    number of the push in it; ``seq``: number of the entry in its push, from 0; ``utc``: for people; ``prev``, ``digest``: SHA-256 of the
-    entry before (of any push of the machine) and of this one.
+    number of the push in it; ``seq``: number of the entry in its push, from 0; ``utc``: time, for people; ``prev``, ``digest``: SHA-256
+    of the entry before (of any push of the machine) and of this one.
     """
 
     number: int = 0

@@ -40,7 +40,7 @@ class VerificationRecord:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class DiscoveryRecord(DocumentRow):
-    """One search for effects that a campaign's model lacks. ``digest``: of readings, model and program, equal for equal searches."""
+    """One search for effects that a campaign's model lacks. ``digest``: digest of readings, model and program, equal for equal searches."""
 
     campaign_id: int
     digest: str
@@ -65,8 +65,7 @@ class ModelRecord(DocumentRow):
 
 @dataclass(frozen=True, slots=True)
 class NewVersion:
-    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: the model has no version
-    yet."""
+    """A new version of a machine's model. ``after``: the version that must be current when it is stored; None: there is no version yet."""
 
     machine: str
     after: int | None

@@ -230,8 +230,9 @@ class BarSetup(Setup):
 class LaserSetup(Setup):
     """Mounting of a laser along one line.
 
-    ``diagonal``: letters of the body diagonal; ``face``: plane of a face diagonal; ``order``: in which a step diagonal moves its axes,
-    empty for a plain one, None if not stated; ``increment_mm``: of a step, by axis; ``overrun_mm``: travel past both ends to turn.
+    ``diagonal``: letters of the body diagonal; ``face``: plane of a face diagonal; ``order``: order in which a step diagonal moves its
+    axes, empty for a plain diagonal, None if not stated; ``increment_mm``: length of a step, by axis; ``overrun_mm``: travel past both
+    ends to turn.
     """
 
     start_mm: Vector | None = None
@@ -282,7 +283,7 @@ class ArtefactPose:
 class ArtefactSetup(Setup):
     """Position of an artefact.
 
-    ``source``: what found its points. ``features``, ``cmm``: as the campaign states them (`Run.with_artefact`).
+    ``source``: instrument that found its points. ``features``, ``cmm``: the campaign's statements (`Run.with_artefact`).
     """
 
     artefact: str
@@ -327,7 +328,7 @@ class RunPart:
 class RunTiming:
     """Agreement of the clocks of a ball-bar run (`abbe.service.runs.sample_columns`).
 
-    ``trouble``: their disagreement, empty without one; ``pieces``: of a path that was resumed; ``document``: all figures as stored.
+    ``trouble``: their disagreement, empty without one; ``pieces``: pieces of a resumed path; ``document``: all figures as stored.
     """
 
     trouble: str = ""

@@ -107,7 +107,7 @@ class NoiseFound(FileObject):
 class OutlierFound(FileObject):
     """A reading that counts less: size in standard deviations, weight 0 to 1.
 
-    ``index``: of the value in the solution, from 0; ``rows``: first and last row of the run's columns, from 1, that went into it.
+    ``index``: number of the value in the solution, from 0; ``rows``: first and last row of the run's columns, from 1, that went into it.
     """
 
     run: str
@@ -158,7 +158,8 @@ class BudgetLineValue(FileObject):
 class WithoutScale(FileObject):
     """The map without the scales that are the largest part of its uncertainty: the common scale, or the scale of each axis.
 
-    ``error_um``: rms of the deviation; ``rms_um``: of its standard uncertainty; ``expanded_vector_um``: 95 % at the worst point.
+    ``error_um``: rms of the deviation; ``rms_um``: rms of its standard uncertainty; ``expanded_vector_um``: 95 % limit of the vector at
+    the worst point.
     """
 
     scales: Literal["common", "axes"]
@@ -258,8 +259,7 @@ class LostMotion(FileObject):
 
 
 class TableRemoval(FileObject):
-    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used for the
-    subtraction."""
+    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used to do so."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]
