@@ -59,8 +59,8 @@ def effect_named(name: str) -> Effect:
 def installed(known: Iterable[str]) -> Plugins:
     """Return the effects that installed packages offer; ``known``: names that the catalogue already uses.
 
-    Never raises. A plug-in that cannot be imported, is no `Effect`, reuses a name or fails the self-test
-    (`abbe.models.effects.self_test`) is left out, and an error names it.
+    Never raises. A plug-in is left out, and an error names it, if it cannot be imported, is no `Effect`, reuses a name or fails the
+    self-test (`abbe.models.effects.self_test`).
     """
     taken, effects, broken = set(known), [], []
     for entry in sorted(entry_points(group=GROUP), key=lambda e: (e.name, e.value)):

@@ -1,4 +1,4 @@
-"""Entries of the model book together: what they contribute to the readings of a campaign, their total size, and whether they cancel."""
+"""Sums of the model book's entries: their contribution to the readings of a campaign, their total size, and whether they cancel."""
 
 from __future__ import annotations
 
@@ -16,8 +16,7 @@ from abbe.service.errors import ModelUnknown
 
 Mask = np.ndarray[tuple[int], np.dtype[np.bool_]]
 ALIKE = 2.0
-"""Largest difference between values of a non-linear parameter, in standard uncertainties, at which the values, and their columns, count
-as equal."""
+"""Largest difference between values of a non-linear parameter, in standard uncertainties, at which values and columns count as equal."""
 OPPOSITE = -0.8
 """If the cosine between two findings' coefficients is below this, the later finding reverses the earlier one; otherwise it is another
 change."""
