@@ -1,7 +1,7 @@
 """Corrections that controls offer according to their manuals, and the best use of a control for an identified machine.
 
-`choices` evaluates each kind of table by the errors that remain over the whole volume in both directions of motion, after removal of the
-best-fit rigid motion and with the numbers rounded as in the control. If the control limits the number of tables, those with the largest
+`choices` evaluates each kind of table by the errors that remain over the whole volume in both directions of motion. The best-fit rigid
+motion is removed, and the numbers are rounded as in the control. If the control limits the number of tables, those with the largest
 reduction are taken first.
 """
 
@@ -285,8 +285,8 @@ class _Builder:
         self._of = {p.name: table_values(known, partial(_added_by, p), self._sets, reference_mm) for p in self.offered}
 
     def together(self, products: tuple[ProductTable, ...], pairs: tuple[Pair, ...]) -> Compensation:
-        """Combine products with own-axis tables and the cross tables of ``pairs`` (axis, output), which correct the errors that the
-        products leave."""
+        """Combine products with own-axis tables and the cross tables of ``pairs`` (axis, output), which correct the rest left by the
+        products."""
         fine, coarse = (axis_tables(self.known, grids, self._values(k, products)) for k, grids in enumerate(self._sets))
         own = _own(self.known, self._control, tuple(t for t in fine if t.own))
         cross = tuple(t for t in coarse if (t.axis, t.output) in pairs)

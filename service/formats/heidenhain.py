@@ -26,9 +26,9 @@ POSITION_DECIMALS = 4
 ASSIGNMENT = "CONFIG.CMA"
 UNIT_MM = 1e-4
 _EQUAL = re.compile(r"DATUM:(\S+)\s+DISTANCE:(\S+)")
-"""Heading of an iTNC 530: equal distances in place of a column AXISPOS. Read, not written."""
+"""Heading of an iTNC 530: equal distances in place of a column AXISPOS. This module reads the heading, but does not write it."""
 STEEPEST = 64
-"""TNC 4xx: neighbouring values may differ by at most the spacing divided by this."""
+"""TNC 4xx: neighbouring values may differ by at most the spacing divided by this number."""
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
