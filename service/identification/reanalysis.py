@@ -56,7 +56,7 @@ class ProcessExecutor:
 
 
 class DaskExecutor:
-    """Runs jobs on a Dask cluster (extra ``fleet``); ``address``: of its scheduler, e.g. ``tcp://127.0.0.1:8786``.
+    """Runs jobs on a Dask cluster (extra ``fleet``); ``address``: address of its scheduler, e.g. ``tcp://127.0.0.1:8786``.
 
     The workers need this version of Abbe with its extra, and the database under the same URL. Anyone who can connect to the scheduler can
     run programs on the cluster: keep it in a separate network, or use TLS (``tls://``).

@@ -212,7 +212,7 @@ class RemovedEffects:
     """A campaign without the effects that tables cannot correct.
 
     ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
-    used; ``version``: of the book, None without one; ``in_force``: the active table whose side effects were subtracted
+    used; ``version``: version of the book, None without a book; ``in_force``: the active table whose side effects were subtracted
     (`abbe.service.identification.removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
     in the readings, which the assessment of a solution needs, empty otherwise.
     """
@@ -239,8 +239,8 @@ def remove_effects(
 ) -> RemovedEffects:
     """Subtract effects that tables cannot correct from a campaign's readings.
 
-    These are the effect of ``table``, active during the measurement, beyond smooth corrections, and those effects of the machine's current
-    model that apply to this campaign and whose remedy is not a table. Without a ``store`` there is no such model.
+    These are the effect beyond smooth corrections of ``table``, which was active during the measurement, and those effects of the machine's
+    current model that apply to this campaign and have another remedy. Without a ``store`` there is no such model.
 
     Raises
     ------

@@ -194,8 +194,8 @@ LARGEST_PART = 0.5
 
 
 def _scale_free(found: Assessment) -> Assessment | None:
-    """Return the assessment without the common scale if this is the largest part of the uncertainty, else without the axes' scales if
-    they are."""
+    """Return the assessment without the common scale if it is the largest part of the uncertainty, else without the axes' scales if
+    these are."""
     for scales in SCALE_TEXTS:
         sources = without_scales(found.sources, scales)
         prediction = _over_volume(sources)
