@@ -37,8 +37,8 @@ BOUNDS = {
 class Answers:
     """Answers of a person; None: not answered.
 
-    ``axis``: X, Y or Z; ``unit``: of the readings, a key of `LENGTHS`; ``sign``: a key of `SIGNS`; ``at_mm``: where the axis stood during a
-    trace; temperatures in °C, ``pressure_hpa`` of the air.
+    ``axis``: X, Y or Z; ``unit``: unit of the readings, a key of `LENGTHS`; ``sign``: a key of `SIGNS`; ``at_mm``: where the axis stood
+    during a trace; temperatures in °C, ``pressure_hpa`` of the air.
     """
 
     axis: str | None = None
@@ -80,7 +80,7 @@ def checked(answers: Answers) -> Answers:
 
 
 def open_questions(content: Content, answers: Answers) -> list[Question]:
-    """Questions that neither the file nor an answer settles; without an answer to each, the file is refused."""
+    """Return the questions that neither the file nor an answer settles; the file is refused until each is answered."""
     out = []
     one: Any = content.test or content.trace
     if one is not None and not one.axis and answers.axis is None:

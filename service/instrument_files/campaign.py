@@ -31,7 +31,7 @@ MOST_SAMPLES = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A campaign made of files, checked like a folder; ``origins``: of each file, in order."""
+    """A campaign made of files, checked like a folder; ``origins``: origin of each file, in order."""
 
     folder: FolderContent
     origins: tuple[SourceFile, ...]
@@ -158,7 +158,7 @@ def _standstill(trace: Trace, answers: Answers) -> tuple[dict[str, F1], str]:
 
 
 def _run(campaign: str, number: int, machine: Doc, axis: str, columns: Mapping[str, F1]) -> Run:
-    """A run. Start is the lowest target and end the highest, so that deviations count along + of the axis."""
+    """Return a run that starts at the lowest and ends at the highest target, so that deviations count along + of the axis."""
     unit, at, parsed = np.eye(3)[AXES.index(axis)], columns[f"{axis.lower()}_mm"], Columns.from_document(dict(columns))
     setup = {
         "setup_id": f"L{number}",

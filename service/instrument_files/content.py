@@ -57,8 +57,8 @@ class Trace:
 class Content:
     """Content of one file.
 
-    ``name``: of the file, without its folder; ``said``: everything that it states, as text; ``machine``: name of the measured machine,
-    empty if not stated; ``notes``: unread parts and remarks; ``unit_known``: False if the unit of ``test`` has to be asked.
+    ``name``: name of the file, without its folder; ``said``: everything that the file states, as text; ``machine``: name of the measured
+    machine, empty if not stated; ``notes``: unread parts and remarks; ``unit_known``: False if the unit of ``test`` has to be asked.
     """
 
     name: str

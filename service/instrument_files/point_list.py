@@ -29,8 +29,8 @@ HEAD = (
     "artefact", "kind", "source", "tool_mm", "origin_mm", "rotation_deg", "expansion_per_K", "u_expansion_per_K", "temperature_C",
     "calibrated_length", "U_mm", "U_per_m_mm", "u_mm",
 )  # fmt: skip
-"""Keys above the header of a CSV file. ``rotation_deg``: about x, then y, then z of the machine; ``calibrated_length``: from, to,
-mm, U mm."""
+"""Keys above the header of a CSV file. ``rotation_deg``: rotations about x, then y, then z of the machine; ``calibrated_length``: two
+features, their distance, mm, and U, mm."""
 PLATE = re.compile(r"\s*Plug Plate:\s*(\S+)")
 PLATE_NAMES = "Meas X    Meas Y     Nom X     Nom Y"
 PLATE_HEAD: Mapping[str, str] = {
