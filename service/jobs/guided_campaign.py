@@ -146,8 +146,7 @@ async def _resumed(session: Session, context: InvestigationContext, plan: Campai
 
 
 def _is_fresh(context: InvestigationContext, name: str) -> bool:
-    """Return whether a campaign has at most half the age that the runs of a table may have: the rest of the campaign takes time, too.
-    Raises NotStored."""
+    """Return whether a campaign has at most half the age that the runs of a table may have: its rest takes time, too. Raises NotStored."""
     age = context.clock.utc() - datetime.fromisoformat(context.store.campaigns.find(name).created_utc)
     return age < timedelta(hours=context.site.limits.age_h / 2.0)
 
