@@ -247,7 +247,7 @@ class Publisher:
         return ended
 
     async def _probe(self) -> None:
-        """Fail early if nothing listens, or what listens is not our broker; unlike connecting by aiomqtt, this can be cancelled.
+        """Fail early if nothing listens, or if the listener is not our broker; unlike a connection by aiomqtt, this can be cancelled.
 
         aiomqtt connects in a thread that cannot be interrupted, and leaves a socket open if it refuses the broker's certificate.
         """
