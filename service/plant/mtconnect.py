@@ -51,7 +51,7 @@ class MtconnectRefusal(Exception):  # noqa: N818 - reads as what it is
 
 @dataclass(frozen=True, slots=True)
 class Observation:
-    """One value of one data item. ``level``: of a condition; ``native``: its code."""
+    """One value of one data item. ``level``: level of a condition; ``native``: code of a condition."""
 
     sequence: int
     item: str
@@ -66,8 +66,7 @@ class Observation:
 
 
 class Agent:
-    """Buffer of observations of one machine, numbered from 1 without gaps. ``instance``: the ``instanceId``, a new number after each
-    start."""
+    """Buffer of observations of one machine, numbered from 1 without gaps. ``instance``: the ``instanceId``, new after each start."""
 
     def __init__(self, instance: int, buffer: int = BUFFER) -> None:
         self._instance, self._size = instance, buffer

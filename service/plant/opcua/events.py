@@ -59,7 +59,7 @@ class Events:
 
     @classmethod
     async def prepared(cls, server: Server, types: Types, machine: Node, since: datetime) -> Events:
-        """Return the events of a server; ``machine``: their source. Subscribers of the server's node and of the machine's get them."""
+        """Return the events of a server for subscribers of its own node and of the machine's node; ``machine``: source of the events."""
         name = (await machine.read_browse_name()).Name
         generators = []
         for kind in (types.result_event, types.alarm_event):
