@@ -56,7 +56,7 @@ def mismatch_doc(f: PushFacts, truth: Truth) -> Doc:
 def go_back(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> Operation:
     """Next operation of a rollback.
 
-    ``state``: that of the last entry, namely ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry;
+    ``state``: state of the last entry: ROLLBACK, RESTAGING, ACTIVATING_BACK or ROLLBACK_PENDING. ``seq``: number of the last entry;
     it gives each lease of the rollback a higher owner id than the one before.
     """
     if known.rested:

@@ -235,7 +235,7 @@ def _unconfirmed(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _not_in_force(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operation:
-    """End the push: the old table acts. A new table that the control laid aside for its next start is discarded: it would act
+    """End the push: the old table acts. A new table that the control laid aside for its next start is discarded; it would act
     unverified."""
     if truth.states[f.target] is BankState.LAID_ASIDE and truth.crc[f.target] == f.crc:
         return _forget(f, known, truth)
@@ -307,7 +307,7 @@ def _keep(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _why_back(known: PushKnowledge) -> str:
-    """Return why to roll back (after a crash, on a stop, without answers); empty: go on."""
+    """Return the reason to roll back (a crash, a stop, no answers); empty: go on."""
     if not known.mine:
         return "interrupted before it was verified"
     return known.stop or ("the controller does not answer" if known.unanswered >= MAX_UNANSWERED else "")

@@ -72,8 +72,8 @@ class Operation:
 class Truth:
     """State of the controller from one coherent read.
 
-    ``crc``: of both banks, 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty if no interlock is open and
-    nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
+    ``crc``: CRC of each bank, 0 for a bank that is not sealed. ``unsafe``: why nothing may be activated now, empty if no interlock is
+    open and nothing moves. ``still_s``: how long the axes have stood. ``now_s``: monotonic host time.
     """
 
     boot: int
@@ -93,8 +93,8 @@ class Truth:
 class Approval:
     """Consent of a person (or of the policy) to exactly one table on exactly one base.
 
-    ``digest``: of what was approved (`abbe.service.push.journal.approval_digest`). ``expiry``: when the approval ends, UTC as text, part of
-    the digest. ``until_s``: the same in monotonic host time, because the wall clock can be set.
+    ``digest``: digest of the approved content (`abbe.service.push.journal.approval_digest`). ``expiry``: when the approval ends, UTC as
+    text, part of the digest. ``until_s``: the same in monotonic host time, because the wall clock can be set.
     """
 
     digest: str
