@@ -1,5 +1,4 @@
-"""Alarms for people: the history of each alarm with the persons behind it, the alarms of a check, and the way from an alarm to a signed
-report.
+"""Alarms for people: the history of an alarm with the persons behind it, the alarms of a check, and the way from an alarm to a report.
 
 The way (check, cause, proposal, approval, push, proof, report) follows from the store alone.
 """
@@ -84,7 +83,7 @@ class PathStep:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class AlarmPath:
-    """The steps of one alarm, from its check to the report. ``begins``: what a search that is ordered now does first."""
+    """The steps of one alarm, from its check to the report. ``begins``: first step of a search that is ordered now."""
 
     alarm: int
     steps: Sequence[PathStep]
