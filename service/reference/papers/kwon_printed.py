@@ -49,8 +49,8 @@ TABLE2_SUMS: dict[str, tuple[Printed, ...]] = {
     "e_y": (_padded("4.520e-2"), Printed("3.155e-4"), _padded("4.550e-2")),
     "e_z": (_padded("1.230e-2"), Printed("1.020e-4"), _padded("1.240e-2")),
 }
-"""Sums of squares: regression, residual, total. That the fourth digit of regression and total is padding is an assumption; it can make a
-row consistent but not reproduced."""
+"""Sums of squares: regression, residual, total. Assumed: the fourth digit of regression and total is padding, which can make a row
+consistent but not reproduced."""
 
 TABLE2_MEAN_SQUARES: dict[str, tuple[Printed, ...]] = {
     "e_x": printed("2.099e-3", "2.160e-6"),

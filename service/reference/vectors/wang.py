@@ -28,7 +28,7 @@ from abbe.service.reference.vector_file import LAYOUT, VectorCase
 
 RANK_STEPS = 20
 RANK_POSITIONS = 20
-"""Found by trial: the effective ranks of the file result only with these."""
+"""Positions found by trial: only with them do the effective ranks equal those in the file."""
 ORDERS2 = ("XYZ", "ZYX")
 RANK_PLANS: dict[str, Callable[[F1], WangPlan]] = {
     "ideal mirror": lambda t: WangPlan(t, RANK_STEPS, RANK_POSITIONS, tilts=False),
