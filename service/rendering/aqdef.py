@@ -1,5 +1,4 @@
-"""The figures of a report in the Q-DAS ASCII transfer format (AQDEF, .dfq): each figure is one characteristic, as statistics programs
-read it."""
+"""The figures of a report in the Q-DAS ASCII transfer format (AQDEF, .dfq), one characteristic for each figure."""
 
 from __future__ import annotations
 

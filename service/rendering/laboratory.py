@@ -1,5 +1,5 @@
-"""A report as a calibration certificate on paper: facts that ISO/IEC 17025 (7.8.2, 7.8.4) requires beside the results, and facts that
-are missing."""
+"""A report as a calibration certificate on paper: facts that ISO/IEC 17025 (7.8.2, 7.8.4) requires beside the results, and missing
+facts."""
 
 from __future__ import annotations
 

@@ -38,8 +38,7 @@ _OWN_ENDS = {
 
 @dataclass(frozen=True, slots=True)
 class _Pattern:
-    """A phrase with places: its text before the first place and after the last, an expression that fits the whole phrase, and the
-    translation."""
+    """A phrase with places: its text before the first place and after the last, an expression for the whole phrase, and the translation."""
 
     head: str
     tail: str

@@ -99,7 +99,7 @@ class Pair:
 
 
 def paired_bars(pairs: Sequence[Pair], names: tuple[str, str], *, key: str, heading: str, unit: Unit = UM) -> str:
-    """Pairs of bars from top to bottom, with whiskers of U. ``names``: of the first and the second bar; ``unit``: display unit."""
+    """Pairs of bars from top to bottom, with whiskers of U. ``names``: names of the first and the second bar; ``unit``: display unit."""
     width, row, top, labels = 640.0, 46.0, 58.0, 170.0
     shown = [(p.name, [None if v is None else (v[0] / unit.size, v[1] / unit.size) for v in (p.first, p.second)]) for p in pairs]
     summary = "; ".join(f"{name}: {_stated(sides[0], unit)}, {_stated(sides[1], unit)}" for name, sides in shown)

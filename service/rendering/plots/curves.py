@@ -64,7 +64,7 @@ OVERLAY = (760.0, 330.0)
 
 
 def overlay_plot(curves: Sequence[tuple[str, Array, Array]], *, key: str, heading: str, labels: tuple[str, str], unit: Unit = UM) -> str:
-    """Up to four curves (name, abscissa, µm) on one scale; ``labels``: of both axes; ``unit``: display unit of the values."""
+    """Up to four curves (name, abscissa, µm) on one scale; ``labels``: labels of both axes; ``unit``: display unit of the values."""
     curves = [(name, x, y / unit.size) for name, x, y in curves]
     summary = "; ".join(f"{name}: {plain(float(y.min()))} … {plain(float(y.max()))} {unit.sign}" for name, _, y in curves)
     svg = Svg(*OVERLAY, key, heading, f"{heading}. {summary}.")
@@ -79,7 +79,7 @@ def overlay_plot(curves: Sequence[tuple[str, Array, Array]], *, key: str, headin
 def difference_plot(x: Array, apart_um: Array, u_um: Array, *, key: str, heading: str, labels: tuple[str, str], unit: Unit = UM) -> str:
     """A difference with its U (k = 2), if known, as dashed lines about zero. A difference between the lines is not significant.
 
-    ``labels``: of both axes; ``unit``: display unit of the values.
+    ``labels``: labels of both axes; ``unit``: display unit of the values.
     """
     order = np.argsort(x, kind="stable")
     x, apart, expanded = x[order], apart_um[order] / unit.size, COVERAGE * u_um[order] / unit.size

@@ -69,7 +69,7 @@ class SignedScale:
         return cls(round_up(largest / HALF) if largest > 0.0 else 1.0)
 
     def style(self, value: float) -> str:
-        """Role of a finite value."""
+        """Colour role of a finite value."""
         band = int(np.clip(np.floor(value / self.step), -HALF, HALF - 1))
         return f"f-d{band + HALF + 1}"
 

@@ -82,7 +82,7 @@ class CurveChange:
 
     @property
     def change_mm(self) -> F1:
-        """New minus old."""
+        """New minus old entries of the table, mm."""
         return np.asarray(self.new_mm - self.old_mm)
 
     @property
