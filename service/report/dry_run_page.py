@@ -44,7 +44,7 @@ def dry_run_report(name: str, machine: Machine, plan: CampaignPlan, runs: tuple[
 
 
 def picture(machine: Machine, plan: CampaignPlan, unit: Unit = MM) -> str:
-    """The paths of a plan in three views with strokes, set-ups, bars and cups, as SVG; ``unit``: of its axes."""
+    """The paths of a plan in three views with strokes, set-ups, bars and cups, as SVG; ``unit``: unit of the axes."""
     return three_views(machine.stroke_mm, [_drawn(k, test) for k, test in enumerate(plan.tests, start=1)], unit=unit)
 
 
