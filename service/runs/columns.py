@@ -201,7 +201,7 @@ def _touches(chunks: Sequence[ChunkRecord]) -> list[TouchRecord]:
 
 
 def _qualified(setup: AnySetup, chunks: Sequence[ChunkRecord]) -> AnySetup:
-    """Return the set-up of an artefact with the radius of the stylus that a qualification sphere showed; others as they are."""
+    """Return the set-up of an artefact with the radius of the stylus that a qualification sphere showed; other set-ups stay as they are."""
     stated = setup.document.get("tool_radius_mm")
     found = qualified_mm(_touches(chunks), float(stated)) if isinstance(setup, ArtefactSetup) and stated is not None else None
     return setup if found is None else setup.noted(tool_radius_mm=round(found[0], 6), u_tool_radius_mm=round(found[1], 6))

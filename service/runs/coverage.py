@@ -105,8 +105,8 @@ GAP_MM, GAP_SAMPLES = 5.0, 10.0
 LEAST_A_TURN = 8
 """Minimum number of readings per turn; in a run with fewer, each group of this many counts as one turn."""
 GAP_STEPS, GAP_SHARE = 3.0, 0.15
-"""For a run from a file, whose commanded path is unknown: two neighbouring readings farther apart than this many median steps, and than
-this share of a laser run or of a turn, leave the path between them unread."""
+"""For a run from a file, whose commanded path is unknown: the path between two neighbouring readings is unread if their distance exceeds
+this many median steps and this share of a laser run or of a turn."""
 
 
 def with_state(run: Run, record: RunRecord, begun: RunStart | None = None) -> Run:

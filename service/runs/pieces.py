@@ -20,7 +20,7 @@ MOST_LOST = 1e-3
 class PathReadings:
     """Readings of a path before its interruption: its valid ``pieces``, and the readings that the rest is compared with.
 
-    ``arc_mm`` and ``deviation_mm``, shape (n,): position along the path and reading, mm; ``boot_id``: of the ball-bar's box.
+    ``arc_mm`` and ``deviation_mm``, shape (n,): position along the path and reading, mm; ``boot_id``: boot id of the ball-bar's box.
     """
 
     pieces: tuple[RunPiece, ...]

@@ -106,8 +106,8 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
 def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc:
     """Return the times of the edges by the arrivals minus those by the controller, ms of controller time.
 
-    Positive: the arrivals date the edge later than the controller does, so by them the path began (or ended) earlier than the sync line
-    shows.
+    Positive: the arrivals date the edge later than the controller does; according to them, the path began (or ended) before the sync
+    line shows it.
     """
     doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
     path_us = end.path_us
