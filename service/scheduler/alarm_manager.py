@@ -149,7 +149,7 @@ class AlarmManager(RetryingStore):
         return await self._read(alarm_numbered, self._store, self._machine, number)
 
     async def settled(self, found: ApprovedProposal, after: int, reported: JobOutcome) -> JobOutcome:
-        """Record how the push after push number ``after`` ended, as the push journal shows it; return the outcome."""
+        """Record the end of the push that followed push number ``after``, as the push journal shows it; return the outcome."""
         done = reconciled(await self._read(self._of_proposal, found.proposal, after), reported)
         await self._record_pushed(found.alarm, found.proposal, after, done)
         return done

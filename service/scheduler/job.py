@@ -162,7 +162,7 @@ async def _record_interruption(job: Job[T]) -> None:
 def is_defect(error: Exception) -> bool:
     """Return whether an error is a defect of this program, not a failure of devices, data or numerics.
 
-    Devices that are watched side by side fail with an exception group; if one member is a defect, the group is one.
+    Devices that are watched side by side fail with an exception group; if one member is a defect, the group counts as a defect.
     """
     return not isinstance(error, FAILURES) and not (isinstance(error, ExceptionGroup) and error.split(FAILURES)[1] is None)
 
