@@ -214,7 +214,7 @@ class FeatureTouch:
         await self.probe.move(target, feed_mm_min=feed, timeout_s=TOUCH_S + self._seconds(feed))
 
     def _seconds(self, feed_mm_min: float) -> float:
-        """Three times the time of the longest way at this feed, for low overrides."""
+        """Return three times the time of the longest way at this feed, as a limit that also holds for low overrides."""
         return 3.0 * 60.0 * 500.0 / feed_mm_min
 
     def _check_radius(self, touched: TouchedFeature) -> None:

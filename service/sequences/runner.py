@@ -128,7 +128,8 @@ class Runner:
     async def run(self, plan: TestPlan, recorder: Recorder, tick: Tick, attempt: Attempt | None = None) -> dict[str, int]:
         """Execute a test, or the rest of it; return the controller times (us) for the end document.
 
-        ``mounted_us``: mounting of a cup or a laser, if this test mounts one; ``path_start_us``, ``path_end_us``: of a ball-bar run.
+        ``mounted_us``: mounting of a cup or a laser, if this test mounts one; ``path_start_us``, ``path_end_us``: start and end of a
+        ball-bar's path.
 
         Raises
         ------

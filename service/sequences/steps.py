@@ -16,7 +16,7 @@ MAX_PATH_POINTS = 8192
 
 @dataclass(frozen=True, slots=True)
 class MoveTo:
-    """Straight move to commanded coordinates. ``guarded``: as a touch command if a probe is fitted, so that a contact stops the axes."""
+    """Straight move to commanded coordinates. ``guarded``: move by a touch command if a probe is fitted; a contact then stops the axes."""
 
     target_mm: Point
     feed_mm_min: float
@@ -111,11 +111,11 @@ class MountArtefact:
 class TouchFeature:
     """Touch a hole or ball from all sides; begins and ends above it, where the stylus is clear of everything.
 
-    ``centre_mm``: expected axis position with the tip in its centre (hole: at the depth of the touches); ``radius_mm``: expected distance
-    of the tip's centre from it when it touches; ``sides``: unit vectors from the centre to the touches; ``inside``: a hole; ``up``: unit
-    vector away from the artefact; ``clear_mm``: height above the centre that is clear. A touch runs from ``search_mm`` before the expected
-    contact to as far beyond it. ``nominal_mm``: in the artefact's axes; ``start_deg``: direction of the first touch; ``u_sphere_mm``:
-    standard uncertainty of the radius of a qualification sphere; None: a feature of the artefact.
+    ``centre_mm``: expected axis position with the tip in its centre (hole: at the depth of the touches); ``radius_mm``: expected
+    distance of the tip's centre from it when it touches; ``sides``: unit vectors from the centre to the touches; ``inside``: a hole;
+    ``up``: unit vector away from the artefact; ``clear_mm``: height above the centre that is clear. A touch runs from ``search_mm``
+    before the expected contact to as far beyond it. ``nominal_mm``: nominal place in the artefact's axes; ``start_deg``: direction of
+    the first touch; ``u_sphere_mm``: standard uncertainty of the radius of a qualification sphere; None: a feature of the artefact.
     """
 
     feature: str
@@ -135,12 +135,12 @@ class TouchFeature:
 
     @property
     def qualifies(self) -> bool:
-        """Whether it is the qualification sphere."""
+        """Whether this is the qualification sphere."""
         return self.u_sphere_mm is not None
 
     @property
     def what(self) -> str:
-        """What it is, for people."""
+        """Name of what is touched, for people."""
         return touched_name(self.feature, qualifies=self.qualifies)
 
     @property

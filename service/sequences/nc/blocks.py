@@ -62,7 +62,7 @@ class Go:
 
 @dataclass(frozen=True, slots=True)
 class Arc:
-    """Arc of less than a full turn in a plane of two axes; ``positive``: from the plane's first axis to its second."""
+    """Arc of less than a full turn in a plane of two axes; ``positive``: the arc runs from the plane's first axis to its second."""
 
     plane: str
     start_mm: Point

@@ -1,5 +1,4 @@
-"""Parts that all recipes share: fields with their limits, the controller's grid, approach positions, and the ball-bar's way to a path's
-start.
+"""Parts that all recipes share: fields with their limits, the controller's grid, approach positions, and the ball-bar's way to a path.
 
 Programs and files (`abbe.service.sequences.recipes.recipe_file`) make the same recipe objects. The limits in the annotations apply to
 files; programs may exceed them, as tests do.

@@ -1,8 +1,8 @@
 """The recipe of an artefact in one pose: every hole or ball touched from all sides, the first one again and again.
 
-The first feature is the reference of the pose: touched again after every ``requalify_every`` features and at the end, it shows whether the
-probe or the artefact has changed meanwhile, and how the pose drifts. With a qualification sphere on the table, the stylus is qualified
-there before the first feature and each time before that is touched again.
+The first feature is the reference of the pose. It is touched again after every ``requalify_every`` features and at the end, to show
+whether the probe or the artefact has changed meanwhile, and how the pose drifts. With a qualification sphere on the table, the stylus is
+qualified there each time before the first feature is touched.
 """
 
 from __future__ import annotations
@@ -36,11 +36,12 @@ class ArtefactTest(TestRecipe):
     """The features of an artefact in one pose.
 
     ``artefact``: its name under ``[artefact]`` of the file; ``origin_mm``: axis position at which the stylus tip is at the artefact's
-    zero; ``rotation_deg``: the artefact's turn about x, then y, then z of the machine; ``stylus_radius_mm``: as qualified;
-    ``stylus_length_mm``: from the centre of its ball to the probe's body of ``body_radius_mm``, None: not known, the body is not checked;
-    ``shaft_radius_mm``: None: as thick as the ball. ``depth_mm``: of the touches in a hole below its nominal place; ``clear_mm``: height
-    above the features at which the way is free. ``turned_every``: every so many features the first touch is at 45 degrees instead of 0,
-    which shows the lobing; 0: never. ``sphere``: on which the stylus is qualified; all ways then lie at one height.
+    zero; ``rotation_deg``: the artefact's turn about x, then y, then z of the machine; ``stylus_radius_mm``: qualified radius;
+    ``stylus_length_mm``: length from the centre of its ball to the probe's body of ``body_radius_mm``, None: unknown, so the body is not
+    checked; ``shaft_radius_mm``: None: as thick as the ball. ``depth_mm``: depth of the touches in a hole below its nominal place;
+    ``clear_mm``: height above the features at which the way is free. ``turned_every``: every so many features the first touch is at 45
+    degrees instead of 0, which shows the lobing; 0: never. ``sphere``: sphere on which the stylus is qualified; all ways then lie at one
+    height.
     """
 
     artefact: Name

@@ -91,8 +91,8 @@ JUDGED = "pnp"
 BACK = "check-back"
 CHORD_MM = 0.5
 """Chord of the helices in a discovery, even along the path: it runs at most 0.24 um inside the sphere at a radius of 120 mm. The usual
-chords run up to 10 um inside. The place of a sample is known only to half a sampling period (0.3 mm at 50 Hz and 2000 mm/min), so its
-readings would scatter there, and a clean machine would seem disturbed."""
+chords run up to 10 um inside. The place of a sample is known only to half a sampling period (0.3 mm at 50 Hz and 2000 mm/min), so
+readings on the usual chords would scatter, and a clean machine would seem disturbed."""
 ROUND: tuple[Literal[1, -1], ...] = (1, -1)
 
 

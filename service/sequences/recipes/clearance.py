@@ -20,12 +20,13 @@ STEP_MM = 1.0
 LONG_MM = 200.0
 """Length of a shaft that is not stated, and of the probe's body above it."""
 ROUNDS = 28
-"""Thirds by which the nearest place on a part is searched: to 1/80,000 of its length."""
+"""Number of thirds in the search for the nearest place on a part: they find it to 1/80,000 of the part's length."""
 
 
 @dataclass(frozen=True, slots=True)
 class ProbePart:
-    """A cylinder about the stylus: from ``from_mm`` to ``to_mm`` above the centre of its ball, away from the artefact; the ball itself."""
+    """A cylinder about the stylus, from ``from_mm`` to ``to_mm`` above the centre of its ball (away from the artefact); or that ball.
+    122: Return the least distance of each body from lines that begin above these places, (bodies,), by thirds: it is convex on a line."""
 
     name: str
     radius_mm: float
@@ -63,7 +64,7 @@ class Solids(Protocol):
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Their names."""
+        """Names of the bodies."""
         ...
 
     def gaps_mm(self, places_mm: Array, up: Array, part: ProbePart) -> Array:
@@ -118,7 +119,8 @@ class Boxes:
         return np.asarray(np.min([self._rod(places_mm + line, up, begin, part.to_mm) for line in lines], axis=0) - radius)
 
     def _rod(self, places_mm: Array, up: Array, from_mm: float, to_mm: float) -> Array:
-        """Return the least distance from a line beginning above these places, (bodies,). It is convex along it: thirds find it."""
+        """Return the least distance of each body from lines that begin above these places, (bodies,), by thirds: it is convex along a
+        line."""
         own, along = ((places_mm - self.origin_mm) @ self.matrix)[:, None], up @ self.matrix
         shape = (len(places_mm), len(self.names))
         low, high = np.full(shape, from_mm), np.full(shape, to_mm)

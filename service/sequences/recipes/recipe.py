@@ -1,7 +1,7 @@
 """Recipes: the parameters of a test; `plan` turns them into steps.
 
-Every axis approaches the first position in the direction of its first motion, so that its lost motion is in a known state at the start; an
-axis that begins at the very end of its stroke cannot. A test that mounts something clears it away at the end.
+Every axis approaches the first position in the direction of its first motion, so that its lost motion is in a known state at the start;
+this is impossible for an axis that begins at the very end of its stroke. A test that mounts something clears it away at the end.
 """
 
 from __future__ import annotations
@@ -151,9 +151,9 @@ class Helix(CupTest):
 class HelixPoints(CupTest):
     """The helix of `Helix` point by point: ``points`` positions from pole to equator (direction -1: back), each read at standstill.
 
-    Between two positions the machine moves along the sphere, so that the bar stays within its stroke, stops half a millimetre before the
-    next one against the motion of each axis, and moves there straight: every axis arrives in its direction of travel between positions.
-    The reading is the mean of ``samples`` samples of the bar, taken after ``settle_s``.
+    Between two positions the machine moves along the sphere, so that the bar stays within its stroke. It stops half a millimetre before
+    the next position, against the motion of each axis, and moves there straight: every axis arrives in its direction of travel between
+    positions. The reading is the mean of ``samples`` samples of the bar, taken after ``settle_s``.
     """
 
     _: KW_ONLY
@@ -211,9 +211,9 @@ class Circle(CupTest):
 
     ``direction`` 1: increasing angles; -1: the same arc back. ``feed_in_deg`` and ``feed_out_deg`` extend the arc along the same circle
     outside the measured part (ISO 230-4: 180 degrees for a full circle). By default the plane normal to ``axis`` has a full circle from
-    0 degrees, and the two planes that contain ``axis`` have the partial arc of 220 degrees about the pole with 2 degrees before and after
-    it: the cup's support is below. ``under_the_cup``: lower points are wanted, and the user has checked that there is room.
-    The machine moves over the pole between two arcs about one cup.
+    0 degrees. The two planes that contain ``axis`` have the partial arc of 220 degrees about the pole, with 2 degrees before and after
+    it: the cup's support is below. ``under_the_cup``: lower points are wanted, and the user has checked that there is room. The machine
+    moves over the pole between two arcs about one cup.
     """
 
     plane: Plane
@@ -381,7 +381,7 @@ class Linear(BeamTest):
     """Single-axis positioning by laser (ISO 230-2), with this number of ``positions`` out and back.
 
     ``at_share``: relative positions in the strokes of the two other axes, in the order X, Y, Z. ``offset_share``: largest pseudo-random
-    shift of a position, as a share of the interval, to reveal periodic errors (ISO 230-2); ``seed``: of the random numbers.
+    shift of a position, as a share of the interval, to reveal periodic errors (ISO 230-2); ``seed``: seed of the random numbers.
     """
 
     axis: AxisIndex
