@@ -214,8 +214,8 @@ class Service:
     def _ask_to_end(self) -> None:
         """Ask page and publisher to end by themselves.
 
-        A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows one that coincides with the awaited result, such as
-        the broker's acknowledgement, and the service would never end.
+        A cancellation alone can get lost: ``asyncio.wait_for`` of Python 3.11 swallows a cancellation that coincides with the awaited
+        result, such as the broker's acknowledgement, and the service would never end.
         """
         self._web.stop()
         if self._publisher is not None:
