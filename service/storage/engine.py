@@ -229,7 +229,7 @@ _PG_LOCK = 0x41626265  # "Abbe": two services starting at once migrate one after
 def known_revisions() -> tuple[str, ...]:
     """Every schema revision that this program can upgrade, oldest first, from the files ``rNNNN_what.py``.
 
-    Alembic takes a quarter of a second to import, and nearly every database is up to date: so this does without it.
+    Alembic takes a quarter of a second to import, and nearly every database is up to date: so this function does without Alembic.
     """
     names = sorted(entry.name for entry in files(_VERSIONS).iterdir() if entry.name.startswith("r") and entry.name.endswith(".py"))
     return tuple(name[1:5] for name in names)

@@ -46,7 +46,7 @@ class Listing:
 
 @dataclass(frozen=True, slots=True)
 class PageRow:
-    """One row of a list; ``columns``: by their public names; ``doc``: its document, None if it was not read."""
+    """One row of a list; ``columns``: values by the columns' public names; ``doc``: its document, None if it was not read."""
 
     number: int
     columns: Mapping[str, Any]

@@ -165,7 +165,8 @@ class Discoveries(Repository):
     """Searches for effects that a campaign's model lacks."""
 
     def add(self, campaign_id: int, digest: str, doc: Doc) -> int:
-        """Open a discovery of a campaign; return its id. ``digest``: of readings, model and program; ``doc``: its start (`SearchBase`)."""
+        """Open a discovery of a campaign; return its id. ``digest``: digest of readings, model and program; ``doc``: its start
+        (`SearchBase`)."""
         return self._add(discoveries, campaign_id=campaign_id, digest=digest, doc=doc, created_utc=self._db.now())
 
     def get(self, discovery_id: int) -> DiscoveryRecord:

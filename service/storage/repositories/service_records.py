@@ -324,7 +324,7 @@ def _take(connection: Connection, slot: SlotRecord, owner: Owner | None) -> bool
 
 
 def _timetable_of(machine: str) -> ColumnElement[bool]:
-    """Condition for the slots of a machine. Not LIKE: SQLite would match MILL-7 for mill-7."""
+    """Condition for the slots of a machine. LIKE is not used, because SQLite would match MILL-7 for mill-7."""
     prefix = f"{machine}/"
     return func.substr(slots.c.schedule, 1, len(prefix)) == prefix
 
