@@ -21,8 +21,8 @@ MOST = 10_000
 class LoginOrigin:
     """Origin of a login attempt.
 
-    ``address``: of the visitor; ``device``: id of a browser with which this account has logged in before, or empty; ``local``: the login
-    comes from the service's own computer; ``pin``: the attempt is a PIN, whose failures do not delay the password.
+    ``address``: address of the visitor; ``device``: id of a browser with which this account has logged in before, or empty; ``local``:
+    the login comes from the service's own computer; ``pin``: the attempt is a PIN, whose failures do not delay the password.
     """
 
     address: str
