@@ -1,7 +1,7 @@
 """Alarms as a pure state machine: raised, held, acknowledged, cleared; and the progress of the work on them.
 
-An alarm belongs to one recipe of one machine and follows from its append-only lines (`AlarmEntryRecord`). A check with a signal raises it,
-every check that does not clear it holds it, and a check without a signal and with the verdict "pass" clears it ("cannot tell" does not).
+An alarm belongs to one recipe of one machine and follows from its append-only lines (`AlarmEntryRecord`). A check with a signal raises
+it. A check without a signal and with the verdict "pass" clears it (the verdict "cannot tell" does not). Every other check holds it.
 Acknowledging is independent: a cleared alarm remains visible until a person acknowledges it. A person may shelve an alarm for a limited
 time, in which it does not ask for attention (ISA-18.2, IEC 62682).
 """
@@ -52,8 +52,8 @@ class FiredRule:
 class AlarmHead:
     """State of an alarm as all interfaces publish it.
 
-    ``signals``: of the last check that raised or held it; ``verification``: number of that check; ``comment``: of the person who
-    acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past.
+    ``signals``: signals of the last check that raised or held it; ``verification``: number of that check; ``comment``: comment of the
+    person who acknowledged it; ``shelved_until_utc``: end of its shelving, perhaps past.
     """
 
     recipe: str

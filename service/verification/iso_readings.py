@@ -135,7 +135,7 @@ def approaches_of(cells: Mapping[tuple[float, int], list[float]], turns: Collect
     Raises
     ------
     ValueError
-        They are fewer than two.
+        Fewer than two positions remain.
     """
     places = sorted({p for p, s in cells if (p, -s) in cells} - set(turns))
     cycles = max((len(cells[p, s]) for p in places for s in (1, -1)), default=0)

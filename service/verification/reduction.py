@@ -1,5 +1,4 @@
-"""Reduction of a test of an axis or a diagonal to 20 °C: temperature and coefficients, by the runs' sensors and the machine file, or why
-not."""
+"""Reduction of a test of an axis or a diagonal to 20 °C: temperature and coefficients from sensors and machine file, or why not."""
 
 from __future__ import annotations
 
@@ -53,9 +52,9 @@ class ScaleTemperature:
 class Reduction:
     """Reduction of a test to 20 °C.
 
-    ``expansion``: of the scales, None if the test is not reduced; ``workpiece``: of the workpieces, None without a coefficient; ``at``:
-    temperature of the scales as text; ``of_workpiece``: coefficient as text; ``text``: the values used, or why the test is not reduced;
-    ``notes``: remarks on its temperature.
+    ``expansion``: coefficient of the scales, None if the test is not reduced; ``workpiece``: coefficient of the workpieces, None if not
+    stated; ``at``: temperature of the scales as text; ``of_workpiece``: coefficient as text; ``text``: the values used, or why the test
+    is not reduced; ``notes``: remarks on its temperature.
     """
 
     expansion: Strain | None
@@ -216,7 +215,7 @@ def _coefficient(expansion: Expansion) -> str:
 def ways(budget: ScaleBudget, reduction: Reduction, standard: str, u_wavelength: float) -> list[Way]:
     """The evaluations of a test, the result first: at 20 °C, as measured, and for the workpieces; without a reduction only as measured.
 
-    ``budget``: of a test that is not reduced; ``u_wavelength``: relative standard uncertainty of the laser's wavelength.
+    ``budget``: budget of a test that is not reduced; ``u_wavelength``: relative standard uncertainty of the laser's wavelength.
     """
     if reduction.expansion is None:
         return [Way(f", {standard}", standard, budget)]

@@ -25,8 +25,9 @@ HEADINGS = ("figure", "checks", "latest", "U (k = 2)", "limit", "state", "since 
 class FigureTrend:
     """Trend of one figure of a machine over its checks, in the figure's unit. Uncertainties have k = 2; unknown values are None.
 
-    ``state``, ``direction``: of the control chart (`abbe.models.trend.Trend`), whose latest values are the last four fields; ``since_utc``:
-    first check of a drift; ``found_utc``: the check that detected it; ``reason``: why the days until the limit are unknown.
+    ``state``, ``direction``: result of the control chart (`abbe.models.trend.Trend`), whose latest values are the last four fields;
+    ``since_utc``: first check of a drift; ``found_utc``: the check that detected it; ``reason``: why the days until the limit are
+    unknown.
     """
 
     figure: str
@@ -61,7 +62,7 @@ class FigureTrend:
 class FigureChart:
     """One figure of the checks in order of time, with its control chart (`abbe.models.trend`).
 
-    ``values``, ``expanded``: in the figure's unit, U with k = 2; ``limit``: of the latest check.
+    ``values``, ``expanded``: in the figure's unit, U with k = 2; ``limit``: limit in the latest check.
     """
 
     figure: str

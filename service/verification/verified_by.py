@@ -22,7 +22,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 
 LATEST_CHECKS = 20
-"""Number of latest checks that are searched for one that measured something."""
+"""Number of latest checks among which the last completed measurement is searched."""
 STRANGE_TABLE = "CMP-010"
 """Code of the alarm for a table in force that the journal does not expect."""
 
@@ -211,7 +211,7 @@ def _measured_with(store: Store, record: VerificationRecord, crc: int | None, si
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """Return when a check's campaign began, or the check if it has no campaign. A command that accepts a table does so before that."""
+    """Return when a check's campaign began, or the check if it has no campaign; `--accept-table` accepts a table before this time."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)

@@ -24,7 +24,7 @@ from abbe.service.runs.observations import run_data
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""A figure may get worse by its U plus this share: of the worst diagonal before for a diagonal, of its own value before for a helix."""
+"""Share by which a figure may get worse beyond its U: for a diagonal, of the worst diagonal before; for a helix, of its own value."""
 
 SAME_AIR_C = 1.0
 """Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is
