@@ -35,7 +35,7 @@ def number(value: float | None) -> str:
 
 
 def without_commands(text: str) -> str:
-    """A told text without its parts that name a command of the command line: a person at the page has none."""
+    """Return a text without the parts that name a command: a person at the page has no command line."""
     if not _COMMAND.search(text):
         return text
     parts = _PARTS.split(_ASIDE.sub("", text))

@@ -84,7 +84,7 @@ def plot_files() -> Markup:
 def environment() -> Environment:
     """The template environment. It escapes everything, since names and fault texts come from devices and files.
 
-    One per process: compiling a template takes 0.1 s, and the environment keeps compiled templates.
+    There is one per process: compiling a template takes 0.1 s, and the environment keeps compiled templates.
     """
     env = Environment(
         loader=FileSystemLoader(HERE / "templates"), autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True
@@ -192,7 +192,7 @@ def _point(check: Verification, key: str, unit: str, changes: Sequence[datetime]
 def figure_verdict(check: Verification, key: str) -> str:
     """Verdict of one figure, by the same guard-banded rule as the check's verdict.
 
-    If the check's verdict has another reason than its figures (e.g. the temperature), it applies to each figure.
+    If the check's verdict has another reason than its figures (e.g. the temperature), the check's verdict applies to each figure.
     """
     found = own_verdicts(check)
     worst = next((verdict for verdict in ("fail", "cannot tell", "pass") if verdict in found.values()), None)

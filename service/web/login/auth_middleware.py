@@ -120,8 +120,8 @@ class AuthMiddleware:
         visit.secret = secret if visit.principal.by == "session" else ""
 
     def _foreign(self, request: HTTPConnection, visit: Visit, need: Need, *, changes: bool) -> Response | None:
-        """Refuse a request from another site's page. Browsers always send the origin; programs send a token, and no cookie that a page
-        could misuse."""
+        """Refuse a request from another site's page. Browsers always send the origin; programs send a token, no cookie that a page could
+        misuse."""
         origin = request.headers.get("origin")
         by_token = visit.principal.by == "token"
         if not (origin is None and by_token) and not is_ours(request, origin, behind_tls=self._behind_tls):

@@ -20,7 +20,7 @@ from abbe.service.web.frame import current
 Translate = Callable[..., str]
 NOTHING = Markup("")
 UM = 1e6
-"""From mm/mm and rad to µm/m and µrad."""
+"""Factor from mm/mm and rad to µm/m and µrad."""
 
 
 @dataclass(frozen=True, slots=True)

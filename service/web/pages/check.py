@@ -194,7 +194,8 @@ LEFT, RIGHT, MIDDLE = 2.0, 14.0, 22.0
 
 
 def gauge_svg(title: str, value: float, expanded: float | None, limit: float | None, verdict: str) -> str:
-    """The bar, from zero to beyond limit and value. All numbers in one unit; ``expanded``: U, None if unknown; ``title``: its text."""
+    """Return the bar of a gauge, from zero to beyond limit and value. All numbers in one unit; ``expanded``: U, None if unknown;
+    ``title``: its text."""
     u = expanded or 0.0
     top = max(1.15 * (limit or 0.0), 1.1 * (abs(value) + u), 1e-12)
 

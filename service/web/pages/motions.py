@@ -1,4 +1,4 @@
-"""The 21 error motions with U; of a chosen one, the runs that show it and the error after a table for it."""
+"""The 21 error motions with U; for a chosen motion, also the runs that show it and the error that a table for it would leave."""
 
 from __future__ import annotations
 

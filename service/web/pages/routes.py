@@ -227,7 +227,7 @@ def _add_rejection(app: FastAPI, context: PageContext) -> None:
 
 
 async def _decided(context: PageContext, work: Callable[[], object]) -> Response | None:
-    """Make a decision; its refusal, or None."""
+    """Make a decision; return its refusal, or None."""
     try:
         await context.read(work)
     except TableRefused as error:

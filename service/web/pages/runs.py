@@ -101,7 +101,7 @@ def readings_of(store: Store, number: int) -> int:
 
 
 def shell_of(_store: Store, record: RunRecord, _rules: Rules) -> RunScreen:
-    """A run whose report comes later."""
+    """Return a run without its report, which is made later."""
     return RunScreen(record, None)
 
 

@@ -1,4 +1,4 @@
-"""Users on the page: an admin adds, disables and changes users; each person changes the own password and PIN. `abbe user` calls the same
+"""Users on the page: an admin adds, disables and changes users, each person the own password and PIN. `abbe user` calls the same
 functions."""
 
 from __future__ import annotations
@@ -130,7 +130,7 @@ async def _changed(request: Request, context: PageContext, what: Callable[[Form]
 
 
 async def _own(request: Request, context: PageContext, work: Callable[[str, Form], None]) -> Response | None:
-    """Apply a form to the person who is logged in and repeats the password; the refusal, or None."""
+    """Apply a form of the logged-in person, who repeats the password; return the refusal, or None."""
     visit: Visit = request.state.visit
     name, form = current().who, await form_of(request) or {}
     if "password" not in form:

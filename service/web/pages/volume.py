@@ -22,8 +22,7 @@ from abbe.service.web.frame import current
 NODES = (3, 4, 5, 6)
 """Nodes per axis. More would make the table too large for a screen; the HTTP interface gives finer grids."""
 STILL, STILL_UM = "0", 1e-9
-"""Text of a component that the chosen motions cannot change; such a component has an uncertainty, µm, not above the second value
-(rounding)."""
+"""Text of a component that the chosen motions cannot change: its uncertainty, µm, is at most the second value, which is rounding."""
 Translate = Callable[..., str]
 NOTHING = Markup("")
 
