@@ -154,8 +154,8 @@ def cycles_of(out_mm: F2, cycles: int, overrun_mm: float = 0.0) -> tuple[F2, F1]
         Positions on the way out.
     cycles : int
     overrun_mm : float
-        How far the machine goes beyond both ends before it turns, so that it approaches every target from the right side. These turning
-        points are part of the result. Without an overrun the machine turns at the end positions, each of which then occurs twice in a row.
+        Travel of the machine beyond both ends before it turns, so that it approaches every target from the right side. These turning
+        points are part of the result. Without an overrun the machine turns at the end positions, and each of these occurs twice in a row.
 
     Returns
     -------
@@ -184,7 +184,7 @@ PLANES: tuple[Plane, ...] = ("XY", "YZ", "ZX")
 FAR_RAD = np.deg2rad(150.0)
 """If two points are farther apart, the path goes over the pole, clear of the cup."""
 LOW_RAD = np.deg2rad(30.0)
-"""The same limit if one of the points lies below the equator."""
+"""Limit as `FAR_RAD`, if one of the points lies below the equator."""
 VERY_LOW = 0.7
 """From a point lower than this share of the radius below the equator, even a short path may hit the foot of the cup."""
 
@@ -221,7 +221,7 @@ def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1)
 def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
     """Return points of the great circle that passes ``at_mm`` in the direction ``along``, at given angles from it (negative: before it).
 
-    Such an arc leads into a path, or out of it, without a corner. It stays on the sphere, so that a mounted bar keeps its length.
+    Such an arc leads into a path, or out of a path, without a corner. It stays on the sphere, so that a mounted bar keeps its length.
 
     Parameters
     ----------
@@ -377,7 +377,7 @@ def _unit_helix(share: F1, turns: float, law: Law, axis: int, span_rad: float) -
 def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -> F2:
     """Return the 63 points that Yang and Kim's program probably made: t = 0, 0.1, .. 6.2, colatitude t / 4, longitude ``turns`` t.
 
-    The paper has 63 samples, as ``t = 0:0.1:2*pi`` would give; this is no proof. The last point is 0.021 rad above the equator.
+    The paper has 63 samples, as ``t = 0:0.1:2*pi`` would give, but this does not prove it. The last point is 0.021 rad above the equator.
 
     Parameters are those of `helix_points` with ``axis`` 1; the result has shape (63, 3), mm.
 

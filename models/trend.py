@@ -1,9 +1,9 @@
 """Trend of a series of check results ("figures"): whether it drifts, since when, and when it will reach its limit.
 
 Figures come at any times, each with a standard uncertainty. Only the ratios of these uncertainties count: mean and scale are estimated
-from the series itself (Hawkins' self-starting chart). Each figure is compared with the mean of all earlier ones; this deviation follows
-Student's t and is transformed to a standard normal variable. While nothing changes, these variables are independent, so that the
-false-alarm rates of CUSUM (ISO 7870-4) and EWMA (ISO 7870-6) hold from the third figure on.
+from the series itself (Hawkins' self-starting chart). The difference between a figure and the mean of all earlier ones follows Student's t
+and is transformed to a standard normal variable. While nothing changes, these variables are independent, so that the false-alarm rates
+of CUSUM (ISO 7870-4) and EWMA (ISO 7870-6) hold from the third figure on.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ SIGNIFICANCE = 0.01
 """Significance level that a slope needs before `forecast` extrapolates it."""
 Z_MAX = 8.0
 MOST_CHECKS = 400
-"""How many of the latest checks a forecast uses; older ones say little about the days ahead."""
+"""Number of the latest checks that a forecast uses; older checks say little about the days ahead."""
 MOST_KNOTS = 200
 FARTHEST = 20.0
 """Longest forecast, as a multiple of the time that the series covers."""
@@ -201,14 +201,14 @@ def mean_of(values: F1, u: F1) -> tuple[float, float]:
 def jumps(change: float, u_change: float, limit: float) -> bool:
     """Return whether a figure grew by more than its uncertainty explains.
 
-    It serves series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, this test takes the stated uncertainties
-    at face value; `JUMP_SIGMAS` and `JUMP_SHARE` leave room for contributions missing in them.
+    This test serves series of fewer than `MIN_CHECKS` checks, whose spread is unknown. Unlike the charts, it takes the stated uncertainties
+    at face value; `JUMP_SIGMAS` and `JUMP_SHARE` allow for contributions that are missing in these uncertainties.
     """
     return change > JUMP_SIGMAS * u_change and change > JUMP_SHARE * limit
 
 
 def _since(side: F1, found: int) -> int:
-    """Return the index after the last zero of a CUSUM up to index ``found``: there the change most probably began."""
+    """Return the index after the last zero of a CUSUM up to index ``found``, where the change most probably began."""
     zero = np.flatnonzero(side[: found + 1] == 0)
     return int(zero[-1]) + 1 if len(zero) else 0
 
@@ -228,8 +228,8 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     """Forecast when the figure reaches its limit, by a model that is constant up to an onset and rises linearly from there.
 
     Weighted least squares give level, slope and day of the onset; an onset at the first check makes a straight line. The residuals give
-    the scale. The interval holds every day on which the limit may be reached without a significantly worse fit (likelihood ratio, F with
-    1 and n - 3 degrees of freedom). It does not cover a later change of the machine's behaviour.
+    the scale. The interval contains every day on which the limit may be reached without a significantly worse fit (likelihood ratio, F with
+    1 and n - 3 degrees of freedom), but does not cover a later change of the machine's behaviour.
     """
     n = len(values)
     if limit is None:

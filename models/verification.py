@@ -78,7 +78,7 @@ def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = Fals
     """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
 
     ``with_machine``: the residual of the machine's solution in place of the whole deviation. Without a calibrated length the common
-    scale is fitted, too. Noise and uncertainty of the form enlarge the rms: they are subtracted in squares, and give its uncertainty.
+    scale is fitted, too. Noise and uncertainty of the form enlarge the rms; both are subtracted in squares, and give its uncertainty.
     """
     p = run.points
     assert p is not None

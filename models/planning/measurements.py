@@ -41,7 +41,7 @@ ORDERS = tuple("".join(p) for p in permutations("XYZ"))
 SHORTEST_TOOL_MM = 1.0
 """A shorter tool vector leaves open on which side of the cup the spindle is."""
 OBLIQUE = 0.5
-"""From this ratio of the tool's second longest to its longest component, the spindle's direction is doubtful."""
+"""The spindle's direction is doubtful from this ratio of the tool's second longest to its longest component on."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,8 +80,8 @@ class Instruments:
     bar_noise_mm, laser_noise_mm : float
         Standard deviation of one reading.
     floor_mm : float
-        Standard uncertainty that averaging cannot reduce, because smooth error functions do not follow the machine (as in the joint
-        solution).
+        Standard uncertainty that averaging cannot reduce, because smooth error functions do not follow the machine exactly (as in the
+        joint solution).
     u_bar_length_mm : float
         Standard uncertainty of each bar's calibrated length.
     u_wavelength : float
@@ -117,7 +117,7 @@ class Instruments:
 
 @dataclass(frozen=True, slots=True)
 class HelixTest:
-    """Ball-bar on a hemispherical helix about one cup, pole to equator or (direction -1) back.
+    """Ball-bar on a hemispherical helix about one cup, from pole to equator or (direction -1) back.
 
     The pole lies along ``axis`` (0 to 2), on the positive (``opens`` 1) or negative (-1) side of the cup, where the spindle is.
     """
@@ -150,7 +150,7 @@ class DiagonalTest:
 
     @property
     def mounting(self) -> str:
-        """Key of the mirror's mounting: tests with the same key share the mirror's tilt."""
+        """Key of the mirror's mounting: tests with the same key have the same mirror tilt."""
         return f"diagonal {self.diagonal}"
 
     @property
@@ -261,7 +261,7 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it may be wrong, empty if the tool fixes it."""
+    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why this may be wrong (empty: the tool shows it)."""
 
     axis: int
     side: int
@@ -274,9 +274,9 @@ class Opening:
 
 
 def opening(machine: Machine, vertical: int = 2) -> Opening:
-    """Find the side of the cup on which the spindle is: against the tool vector, which points from the spindle to the ball.
+    """Find the side of the cup on which the spindle is. The tool vector points from the spindle to the ball, away from this side.
 
-    Without a known tool it is the upper side of the vertical axis, which is right for a vertical spindle.
+    Without a known tool the result is the upper side of the vertical axis, which is right for a vertical spindle.
     """
     longest = int(np.argmax(np.abs(machine.tool_mm)))
     sizes = np.sort(np.abs(machine.tool_mm))

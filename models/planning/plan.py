@@ -1,8 +1,8 @@
-"""Plan a campaign: which set-ups in which order, the uncertainty after each step, and what remains unobservable.
+"""Plan a campaign: set-ups in their order, the uncertainty after each step, and the combinations that remain unobservable.
 
 The uncertainties are the posterior (Bayesian Cramer-Rao) bound of the planned readings, with the temperatures of bars and scales as in the
 solution's own budget (`abbe.models.uncertainty.inputs`). They neglect error motions above the planner's order, and take noise and
-typical sizes as known, although the solver estimates them from the readings.
+typical sizes as known, although the solver estimates both from the readings.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ PASSES = 8
 def not_observable(what: PlanningProblem, runs: Iterable[RunData]) -> tuple[str, ...]:
     """Sentences about the hidden combinations of a plan's runs, with cause and cure, as in the solver's own report.
 
-    First combinations hidden with this tool, then those that only another tool would show, then advised additions.
+    Combinations hidden with this tool come first, then those that only another tool would show, then advised additions.
     """
     tools = what.tools
     found = observability(
@@ -65,7 +65,7 @@ class PlanStep:
     test : HelixTest, DiagonalTest or LineTest
     role : "identify", or "holdout" for the run that is not fitted and lowers no uncertainty.
     minutes, until_min : float
-        Set-up and machine time of this step; of the plan up to the end of this step.
+        Set-up and machine time of this step; time of the plan up to the end of this step.
     u_worst_mm, u_mean_mm : float
         Standard uncertainty of the deviation vector (rigid motion removed) after this step: at the worst node, and the root mean square
         over the nodes of the inner volume.
@@ -90,7 +90,7 @@ class MeasuringPlan:
     machine : Machine
     tools : Instruments
     steps : tuple of PlanStep
-        In the order of measuring: the set-up that gains most per minute comes first. One of them is the holdout run (`judge`).
+        Steps in the order of measuring: the set-up that gains most per minute comes first. One step is the holdout run (`judge`).
     runs : tuple of RunData
         The runs of a perfect machine: positions, directions, times and weights of the block means, deviations zero.
     u_before_mm : tuple of two floats
@@ -100,7 +100,7 @@ class MeasuringPlan:
     open_questions : tuple of str
         Sentences about combinations of error motions that the plan cannot observe, with cause and cure.
     goal : Goal or None
-        How the plan meets the wanted uncertainty; None if none was wanted.
+        Result for the wanted uncertainty; None if no uncertainty was wanted.
     warnings : tuple of str
         Points that the operator must check before anything moves.
     """
@@ -122,7 +122,7 @@ class MeasuringPlan:
 
     @property
     def judge(self) -> PlanStep | None:
-        """The holdout run; None: the minutes are too few for one."""
+        """The holdout run; None if the minutes are too few."""
         return next((s for s in self.steps if s.role == "holdout"), None)
 
     @property
@@ -153,7 +153,7 @@ def plan_campaign(
     minutes : float
         Set-up and machine time together.
     goal_mm : float, optional
-        Wanted expanded uncertainty U = 2 u (mm) at the worst node: a plan that reaches it ends with the step that does.
+        Wanted expanded uncertainty U = 2 u (mm) at the worst node. The plan ends with the step that reaches this value.
     vertical : int
         Index of the vertical axis. Hemispheres open upwards along it if the tool vector does not show where the spindle is.
     progress : callable
@@ -226,7 +226,7 @@ def _steps(search: PlanSearch, chosen: Chosen) -> tuple[PlanStep, ...]:
 
 
 def _judged(search: PlanSearch, steps: tuple[PlanStep, ...], budget_min: float) -> tuple[PlanStep, ...]:
-    """Insert the judge after the last test of its mounting, if it fits into the minutes; later steps end later."""
+    """Insert the holdout run after the last test of its mounting, if it fits into the minutes; later steps then end later."""
     chosen: Chosen = {}
     for s in steps:
         chosen[s.test.mounting] = (*chosen.get(s.test.mounting, ()), s.test)

@@ -1,6 +1,6 @@
 """Posterior bound of the uncertainty in a plane of the machine in which an artefact of unknown form was probed in several poses.
 
-Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share unknowns, the form of the artefact. So all poses are
+Unlike the mountings of bars and lasers (`abbe.models.planning.problem`), poses share the unknown form of the artefact. So all poses are
 evaluated together.
 """
 

@@ -1,8 +1,8 @@
 """Information of one mounting, as a matrix over the unknowns that all mountings share.
 
-Shared are the smooth terms, the lost motion, the bars' lengths and temperature and the laser's wavelength. Cup, mirror tilts, zero and
-drift belong to one mounting and are marginalised (Schur complement with their priors). The shared unknowns count as independent ones of
-prior variance 1 (`PlanningProblem.root`), so the prior's information is the unit matrix.
+The mountings share the smooth terms, the lost motion, the bars' lengths and temperature and the laser's wavelength. Cup, mirror tilts, zero
+and drift belong to one mounting and are marginalised (Schur complement with their priors). The shared unknowns are expressed by independent
+ones of prior variance 1 (`PlanningProblem.root`), so the prior's information is the unit matrix.
 """
 
 from __future__ import annotations
@@ -88,7 +88,7 @@ def _search_runs(what: PlanningProblem, tests: tuple[Measurement, ...]) -> tuple
 
 
 def _sigma(what: PlanningProblem, run: RunData) -> F1:
-    """Standard uncertainty of each value; scaled so that few planned points carry as much information as the real block means."""
+    """Standard uncertainty of each value, scaled so that few planned points contain as much information as the real block means."""
     tools = what.tools
     if run.kind == "laser":
         return np.hypot(tools.laser_noise_mm / np.sqrt(run.weight_n), tools.floor_mm)
@@ -110,7 +110,7 @@ def _shared_columns(what: PlanningProblem, run: RunData, full: F2, setup_names: 
 
 
 def factor(information: F2) -> F2:
-    """Rows F with F^T F = information, without directions that hold less than 1e-5 of the prior's information, shape (r, size)."""
+    """Rows F with F^T F = information, without directions of less than 1e-5 of the prior's information, shape (r, size)."""
     value, vector = scipy.linalg.eigh(information, driver="evd")  # faster than a driver that finds only the needed eigenvalues
     kept = value > 1e-5
     return np.asarray(np.sqrt(value[kept])[:, None] * vector.T[kept])
@@ -131,7 +131,7 @@ def scale_temperature_mm2(what: PlanningProblem, rows: F2) -> F1:
     """Variance from the scales' unknown temperature at each node of ``rows`` (`field_rows`), rigid motion removed, shape (nodes^3,), mm^2.
 
     As in the budget of a solution (`abbe.models.uncertainty.sources`), each axis is independently too long by expansion times temperature.
-    No reading shows this, because it concerns the days after the campaign.
+    No reading shows this error, because it concerns the days after the campaign.
     """
     slope = what.tools.inputs.u_scale_temperature_k * what.tools.inputs.scale_expansion_per_k
     out = np.zeros(rows.shape[0])

@@ -1,8 +1,8 @@
 """Choose measurements for the available minutes, greedily by gain per minute and then by exchanges; find the minutes for a goal.
 
 The criterion is I-optimal: the variance of the predicted deviation, rigid motion removed, over the inner volume, as a power mean over the
-nodes: between the plain mean (power 1) and the worst node (infinite power). It leaves out the temperature of the scales, which no choice of
-measurements changes.
+nodes, which lies between the plain mean (power 1) and the worst node (infinite power). The temperature of the scales is left out, because
+no choice of measurements changes it.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ from abbe.models.planning.problem import (
 )
 
 POWER = 4.0
-"""Power of the mean over the nodes: high enough that the worst node governs, low enough that every step still gains something."""
+"""Power of the mean over the nodes: high enough that the worst node dominates, low enough that every step still gains something."""
 SEARCH_NODES = 4
 THRIFTS = (1.0, 0.5, 0.0)
 """Exponents of the minutes in gain / minutes^thrift: 1 prefers cheap measurements, 0 large gains."""
@@ -136,7 +136,7 @@ class PlanSearch:
         return ranked[0] if ranked else None
 
     def ranking(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...], thrift: float = 1.0) -> list[Measurement]:
-        """Rank the affordable tests, of the pool and at cups already chosen: highest gain / minutes^thrift first."""
+        """Rank the affordable tests, both those of the pool and those at cups already chosen: highest gain / minutes^thrift first."""
         costs = self._affordable(chosen, budget_min, pool)
         if not costs:
             return []
@@ -217,17 +217,17 @@ class PlanSearch:
         return chosen
 
     def judge(self, chosen: Chosen, budget_min: float) -> Measurement | None:
-        """Return the holdout run of a plan. It uses a mounting of the plan, so that only the machine can make it deviate.
+        """Return the holdout run of a plan. It uses a mounting of the plan, so that only the machine, no new set-up, can cause a deviation.
 
-        It takes the longest bar in the other direction, else another step order of a diagonal. None: no such run fits into the rest of the
-        minutes, and into `JUDGE_SHARE` of them.
+        The run has the longest bar in the other direction, or else another step order of a diagonal. None: no such run fits into the
+        remaining minutes and into `JUDGE_SHARE` of all minutes.
         """
         most = min(budget_min - self.total_min(chosen), JUDGE_SHARE * budget_min)
         found = [t for tests in chosen.values() for t in _unused(tests) if self.cost_min(t, tests) <= most]
         return max(found, key=_reach_mm, default=None)
 
     def with_room(self, chosen: Chosen, budget_min: float) -> Chosen:
-        """Make room in a full plan for the longest holdout run (`judge`) that costs at most `JUDGE_LOSS`; else return it unchanged."""
+        """Make room in a full plan for the longest holdout run (`judge`) that costs at most `JUDGE_LOSS`; else return the same plan."""
         most = self.criterion(chosen) + JUDGE_LOSS
         tried = {-1.0: chosen}
         for smaller in (chosen, *_without_one(chosen)):
@@ -282,9 +282,9 @@ class Goal:
     reached : bool
         Whether the plan reaches ``wanted_mm``.
     minutes_needed : float or None
-        Minutes after which it is reached; None: not within `LONGEST_MIN`.
+        Minutes after which a plan reaches ``wanted_mm``; None: not within `LONGEST_MIN`.
     limit_mm : float
-        U that would remain if every candidate were repeated without end, temperature of the scales included: no plan reaches less.
+        U that would remain if every candidate were repeated without end, temperature of the scales included; no plan reaches a smaller U.
     limit_by : str
         Main contribution to the limit, as text.
     """

@@ -4,7 +4,7 @@ A batch of results has 10^4 trials of 3 figures per point, so at most `MOST_POIN
 in several calls: the same seed draws the same errors for any points, except the scatter of `StatedInputs.single_approach`.
 
 Linear trials apply the solver's gain to a whole batch at once. Exact trials iterate like the solver with the exact reading of every run
-(finite rotations, length of the bar, tilted mirror). They are slow, and show that the linear trials are good enough.
+(finite rotations, length of the bar, tilted mirror). Exact trials are slow; they show that the linear trials are good enough.
 """
 
 from __future__ import annotations
@@ -174,8 +174,8 @@ def campaign_trials(
 ) -> CampaignTrials:
     """Prepare trials of a solution for a prediction at points, shape (m, 3); tool and frame as in `predict_deviation`.
 
-    ``distributions``: by name of the source, e.g. `LIMITS`; each has unit standard deviation (``u`` 1 for normal and rectangular). All
-    other sources are normal. The repeatability of the machine is part of the readings' noise and drawn with it.
+    ``distributions``: distributions by name of the source, e.g. `LIMITS`, each with unit standard deviation (``u`` 1 for normal and
+    rectangular). All other sources are normal. The repeatability of the machine is part of the readings' noise and drawn with it.
 
     Raises
     ------

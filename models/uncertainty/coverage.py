@@ -60,7 +60,7 @@ class Interval:
 
 
 def apart_from_zero(vectors: F2, covariance: F3, probability: float = PROBABILITY) -> NDArray[np.bool_]:
-    """Whether the coverage ellipsoid of each vector excludes zero; at 95 % this happens to 5 % of all vectors of pure noise.
+    """Whether the coverage ellipsoid of each vector excludes zero; at 95 % this is true for 5 % of all vectors of pure noise.
 
     Parameters
     ----------

@@ -1,7 +1,7 @@
 """Stated inputs of an uncertainty budget, in addition to the campaign's data; each default is an ASSUMPTION.
 
 The solution of a campaign includes the noise of its readings and the priors of its set-ups, but not temperatures or errors that its smooth
-model cannot follow. Those are stated here, and the budget marks them as stated.
+model cannot follow. These inputs are stated here, and the budget marks them as stated.
 """
 
 from __future__ import annotations
@@ -23,16 +23,17 @@ class StatedInputs:
     Attributes
     ----------
     u_wavelength : float
-        Relative standard uncertainty of the laser's wavelength after air compensation; all runs share one laser. It counts only for a
-        solution whose unknowns do not include the wavelength.
+        Relative standard uncertainty of the laser's wavelength after air compensation; all runs share one laser. This input counts only if
+        the wavelength is not an unknown of the solution.
     u_scale_temperature_k, scale_expansion_per_k : float
         Standard uncertainty of each scale's temperature, K, and expansion coefficient of the scales, 1/K. 0.2 K stands for a Pt100 on the
         scale and a drift of ±0.3 K during the campaign. The three axes are independent.
     u_bar_temperature_k, bar_expansion_per_k : float
-        The same for the ball-bar, relative to its calibration temperature; one thermometer serves all bar runs.
+        Standard uncertainty of the bar's temperature relative to its calibration temperature, K, and expansion coefficient of the bar, 1/K;
+        one thermometer serves all bar runs.
     repeatability_mm : float
-        Standard deviation of the machine from one approach of a point to the next, per component. The readings' scatter contains it, so
-        the budget subtracts it from the noise of the readings, down to zero. Default 0: not known separately.
+        Standard deviation of the machine from one approach of a point to the next, per component. The readings' scatter contains this
+        repeatability, so the budget subtracts it from the noise of the readings, down to zero. Default 0: not known separately.
     repeatability_dof : float
         Degrees of freedom of ``repeatability_mm``; inf if it is stated.
     single_approach : bool

@@ -1,6 +1,6 @@
 """Propagation of distributions by Monte Carlo with as many trials as the wanted digits need (GUM-S1 7).
 
-`validate` checks the GUM's law of propagation against it (GUM-S1 8).
+`validate` checks the GUM's law of propagation against the trials (GUM-S1 8).
 """
 
 from __future__ import annotations
@@ -73,7 +73,7 @@ def adaptive(
     Parameters
     ----------
     draw : callable
-        Returns the results of one batch of trials, shape (trials, m). A batch takes 0.24 MB per point; the peak is about three times that.
+        Returns the results of one batch of trials, shape (trials, m). A batch takes 0.24 MB per point; the peak is about three times this.
     rng : Generator
         Seeded by the caller; the same seed gives the same figures.
     digits : int
@@ -154,7 +154,7 @@ def numerical_tolerance(u: F1, digits: int) -> F1:
 class Validation:
     """Check of the law of propagation against Monte Carlo, shapes (m,).
 
-    ``low``, ``high``: by how much the two ends of the coverage interval differ between the two methods.
+    ``low``, ``high``: differences of the two ends of the coverage interval between the two methods.
     """
 
     low: F1

@@ -3,7 +3,7 @@
 By rule G a deviation is J m: the 18 error motions m, each a function of its own axis, times the levers J. On a grid the
 covariance of m therefore consists of blocks of 6 x 6 that depend on one or two of the three positions: they are computed once for each pair
 of lines, and a point needs only products with its levers. A rigid motion that is removed is a fourth block, which depends on no position.
-A point costs some microseconds; its design of hundreds of terms times the factor of every source costs ten times as much.
+A point costs some microseconds; its design of hundreds of terms times the factor of every source would cost ten times as much.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ Take = Callable[[slice, F4], None]
 def grid_covariances(
     machine: Machine, terms: tuple[Term, ...], lines: Lines, frame: RigidFree | None, factors: Sequence[F2], take: Take
 ) -> None:
-    """Compute the covariance that each of several factors gives the deviation at every point of a grid, a stretch of points at a time.
+    """Compute the covariance of the deviation by each of several factors at every point of a grid, a stretch of points at a time.
 
     Parameters
     ----------
@@ -114,7 +114,7 @@ def _pair(left: list[F3], right: list[F3]) -> F4:
 
 
 def _own(block: list[F3]) -> F3:
-    """Return half the covariance of one block at each of its positions, shape (n, 6, 6 S): the sum with its transpose is the whole."""
+    """Return half the covariance of one block at each of its positions, shape (n, 6, 6 S); the sum with its transpose is the covariance."""
     return np.concatenate([0.5 * one @ np.swapaxes(one, 1, 2) for one in block], axis=2)
 
 

@@ -160,7 +160,7 @@ class Prediction:
     def expanded_vector_mm(self) -> F1:
         """Longest half-axis of the ellipsoid that holds the whole vector with the coverage probability, shape (m,).
 
-        It assumes many degrees of freedom, and is then larger than the expanded uncertainty of any component.
+        Many degrees of freedom are assumed. The result is then larger than the expanded uncertainty of any component.
         """
         widest = np.sqrt(np.maximum(np.linalg.eigvalsh(self.covariance_mm2)[:, -1], 0.0))
         return np.asarray(vector_factor(3, self.probability) * widest)
@@ -254,7 +254,7 @@ def _on_grid(sources: ErrorSources, points: F2, lines: Lines, tool_mm: F1 | None
 
 
 def _factors(sources: ErrorSources) -> list[F2]:
-    """The factor of every source, then what is subtracted from some."""
+    """The factor of every source, then the factors that are subtracted from some sources."""
     return [s.factor for s in sources.sources] + [s.subtracted for s in sources.sources if s.subtracted is not None]
 
 
@@ -357,8 +357,8 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
     Parameters
     ----------
     prediction : Prediction
-        In the frame of the correction. For a map this is the rigid-free frame (`abbe.models.geometry.volume`); otherwise a displacement of
-        the whole workpiece, which is not an error, would decide.
+        Prediction in the frame of the correction. For a map this is the rigid-free frame (`abbe.models.geometry.volume`); otherwise a
+        displacement of the whole workpiece, which is not an error, would count.
     k : float, optional
         Coverage factor; default: that of the prediction's own probability and degrees of freedom.
     smallest_mm : float

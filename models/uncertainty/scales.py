@@ -1,7 +1,7 @@
 """A solution without the scales of the axes, for runs that do not determine them.
 
 A ball-bar of unknown length cannot separate a common scale from its length; a laser along diagonals cannot separate the scales of the axes
-from the tilt of its mirror. Everything else may be known well. So the best-fit scale over the volume is projected out of the coefficients,
+from the tilt of its mirror. All other errors may be known well. So the best-fit scale over the volume is projected out of the coefficients,
 together with the best-fit rigid motion (`abbe.models.geometry.volume`), and out of every source of their uncertainty.
 """
 
@@ -26,7 +26,7 @@ NODES = 5
 
 
 def scale_projection(machine: Machine, terms: tuple[Term, ...], scales: Scales) -> F2:
-    """Return the matrix from coefficients to those of the same map without its best-fit scale over the volume, shape (terms, terms).
+    """Return the matrix that takes coefficients to those of the map without its best-fit scale over the volume, shape (terms, terms).
 
     Scale and rigid motion are fitted together over an even grid over the strokes. The rigid motion stays in the map.
 

@@ -91,7 +91,7 @@ class Response:
         Change of every unknown per standard deviation of each independent part of the prior (`prior_factor`): pull pull^T is the prior's
         share C P^-1 C.
     widening : array, shape (p, p)
-        Covariance of the solution minus ``covariance``: the sizes are uncertain, too. It can be negative in some directions.
+        Covariance of the solution minus ``covariance``, because the sizes are uncertain, too. It can be negative in some directions.
     dof : float
         Degrees of freedom of all residuals together.
     """
@@ -105,7 +105,7 @@ class Response:
     dof: float
 
     def of_readings(self, error_mm: F1) -> F1:
-        """Change of every unknown if each reading is wrong by ``error_mm`` (n,): C A^T W e, shape (p,)."""
+        """Change of every unknown if each reading has the error ``error_mm`` (n,): C A^T W e, shape (p,)."""
         return np.asarray(self.covariance @ (self.design.T @ (error_mm * self.weight)))
 
     def noise_factor(self, variance_mm2: F1 | None, mask: np.ndarray[tuple[int, ...], np.dtype[np.bool_]]) -> F2:
@@ -172,10 +172,10 @@ def prior_factor(root: F2) -> F2:
 
 @kept
 def order_source(solution: JointSolution, orders_above: int) -> tuple[tuple[Term, ...], F2]:
-    """Return the P terms of the solution and of the orders above it, and the factor (P, q) of the covariance due to the latter.
+    """Return the P terms of the solution and of the orders above it, and the factor (P, q) of the covariance due to the orders above.
 
-    The prediction leaves out the orders above. So the values that the residuals suggest for them do not correct it; they count in full as
-    uncertainty, as one more column of the factor.
+    The prediction leaves out the orders above. The values that the residuals suggest for these orders do not correct the prediction; they
+    count in full as uncertainty, as one more column of the factor.
     """
     above = omitted_terms(solution.terms, orders_above)
     terms = (*solution.terms, *above)
@@ -204,8 +204,8 @@ def chosen_order(solution: JointSolution) -> int:
 def omitted_terms(terms: tuple[Term, ...], orders_above: int) -> tuple[Term, ...]:
     """Terms of the ``orders_above`` Legendre orders above the highest one of each error motion, or of the model if it lacks the motion.
 
-    A motion with a rough part gets none. Inside the stroke the next four orders would add 6 % to its variance. But at the ends, where every
-    Legendre polynomial is 1 and its own orders are already twice as large as elsewhere, they would double it.
+    A motion with a rough part gets no further orders. Inside the stroke the next four orders would add 6 % to its variance, but at the
+    ends, where every Legendre polynomial is 1 and its own orders are already twice as large as elsewhere, they would double the variance.
     """
     order = {t.motion: t.order for t in sorted(terms, key=lambda t: t.order) if t.order}
     model = max((v for v in order.values() if v <= SMOOTH_ORDER), default=0)
@@ -257,7 +257,7 @@ FROM_READINGS = frozenset({"bar_noise", "laser_noise", "artefact_noise", "estima
 
 
 LASER_SCALE = "laser_scale"
-"""The solution's unknown for the wavelength, held by its prior; for a solution without it, `StatedInputs.u_wavelength` counts."""
+"""The solution's unknown for the wavelength, limited by its prior; for a solution without it, `StatedInputs.u_wavelength` counts."""
 
 
 @dataclass(frozen=True)
@@ -381,7 +381,7 @@ def _compressed(factor: F2) -> F2:
 
 
 def _noise(r: Response, inputs: StatedInputs) -> list[Source]:
-    """Return the noise of each instrument's readings without the machine's repeatability, and this repeatability as a source of its own."""
+    """Return the noise of each instrument's readings without the machine's repeatability, and this repeatability as a separate source."""
     out = []
     everywhere = np.ones(r.weight.size, dtype=np.bool_)
     variance = 1.0 / np.where(r.weight > 0, r.weight, np.inf)
@@ -441,7 +441,7 @@ def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> 
 
 
 def _travel(run: RunData) -> F1:
-    """Return the distance along the beam from the first record, mm; a wrong wavelength falsifies the reading in proportion. 0: ball-bar."""
+    """Return the distance along the beam from the first record, mm; a wrong wavelength causes a proportional error. 0: ball-bar."""
     if run.beam is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)

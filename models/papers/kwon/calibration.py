@@ -3,9 +3,9 @@
 Kwon's paper leaves this step open: it supposes that errors of the kinematic parameters cause the position errors (4.2), but fits a surface
 to them. Here the 18 parameters are estimated (R, r, l, thb, thp, dz of three legs, `abbe.models.papers.kwon.kinematics`), together with the
 unknown placement on the CMM. Each parameter has a stated prior; the result names the parameters that rest on it. If the points scatter more
-than stated or contradict the prior, `weigh` widens the uncertainty of the points or of the prior, and the result reports it.
+than stated or contradict the prior, `weigh` widens the uncertainty of the points or of the prior, and the result reports the factors.
 
-"Carried" directions of parameter space are those about which the points say more than the prior.
+"Carried" directions of parameter space are those that the points determine better than the prior.
 """
 
 from __future__ import annotations
@@ -74,8 +74,8 @@ class Weights:
     variance_factor : float
         Factor, 1 or more, on the variance of the points: the part of the misfit that no parameter can explain, over its degrees of freedom.
     prior_factor : float
-        Common factor, 1 or more, on all prior standard deviations, since the points cannot judge each by itself. It brings ``test.chi2``
-        down to dof or, if that is at least twice the dof, to dof - 2 (dof / 2 if dof is below 4), because a factor estimated from few
+        Common factor, 1 or more, on all prior standard deviations, since the points cannot test each of them alone. It brings ``test.chi2``
+        down to dof or, if chi2 is at least twice the dof, to dof - 2 (dof / 2 if dof is below 4), because a factor estimated from few
         directions is too small as often as too large.
     carried : int
         Number of carried directions, with both factors.
@@ -98,7 +98,7 @@ def weigh(design: F2, observed: F1, prior_sd: F1) -> Weights:
     Parameters
     ----------
     design : array, shape (m, p + q)
-        In units of the noise; the last q columns (placement) have no prior.
+        Design in units of the noise; the last q columns (placement) have no prior.
     observed : array, shape (m,)
     prior_sd : array, shape (p,)
     """
@@ -125,7 +125,7 @@ def outlying_points(residual: F2) -> tuple[int, ...]:
     Parameters
     ----------
     residual : array, shape (n, 3)
-        In units of the stated uncertainty. If their median length is larger than expected, it sets the scale.
+        Residuals in units of the stated uncertainty. If their median length is larger than expected, this length sets the scale.
     """
     length2 = (residual**2).sum(axis=1)
     scale = max(1.0, float(np.median(length2) / scipy.special.chdtri(SPATIAL, 0.5)))
@@ -260,8 +260,8 @@ class KwonCalibration:
     prior_test : PriorTest
         Whether the points contradict the prior as it was stated.
     prior_factor : float
-        Factor, 1 or more, by which all prior standard deviations were widened to explain the deviations in the carried directions. No data
-        can check it for the other directions.
+        Factor, 1 or more, by which all prior standard deviations were widened to explain the deviations in the carried directions. For the
+        other directions no data can check the factor.
     outlying : tuple of int
         Rows of points that stand out from the others. They are not left out.
     """
@@ -279,7 +279,7 @@ class KwonCalibration:
 
     @property
     def on_prior(self) -> tuple[str, ...]:
-        """Parameters about which the prior says more than the points."""
+        """Parameters that the prior determines better than the points."""
         return tuple(name for name, share in zip(self.estimate.names, self.estimate.data_share, strict=True) if share < CARRIED)
 
     @property

@@ -64,7 +64,7 @@ class CollinearPoints(KwonError):
 
 
 class SurfaceNotDetermined(KwonError):
-    """The points do not determine the cubic response surface, or leave no residual to judge it."""
+    """The points do not determine the cubic response surface, or leave no residual to test the surface."""
 
 
 class ExtrapolationRefused(KwonError):
@@ -89,7 +89,7 @@ def refuse(kind: type[PoseError], bad: NDArray[np.bool_], text: str) -> None:
 
 
 def refuse_first(*faults: Fault) -> None:
-    """Raise the first fault in the list that any pose has; its message also counts the poses with later faults only.
+    """Raise the first fault in the list that any pose has; its message also counts the poses that have only later faults.
 
     Parameters
     ----------

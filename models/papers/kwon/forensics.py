@@ -110,7 +110,7 @@ def implied_plane(beta: F2, leave_out: tuple[tuple[int, int], ...] = ()) -> Impl
 
 
 def square_grid(half_mm: float = 1.0, step_mm: float = 0.25, z_mm: float = 0.0) -> F2:
-    """Return grid points of the square |x|, |y| <= half at one height, y fastest, shape (n, 3); the paper's has +-1 mm and 0.25 mm."""
+    """Return grid points of the square |x|, |y| <= half at one height, y fastest, shape (n, 3); the paper has +-1 mm, step 0.25 mm."""
     steps = round(2.0 * half_mm / step_mm)
     if steps < 1 or abs(steps * step_mm - 2.0 * half_mm) > 1e-9 * half_mm:
         raise ValueError(f"square grid: {step_mm:g} mm does not divide {2.0 * half_mm:g} mm")
@@ -128,9 +128,9 @@ def grid_sums(in_plane: F1, half_mm: float = 1.0, step_mm: float = 0.25) -> Grid
 def coefficients_from_planes(first: F1, z1_mm: float, second: F1, z2_mm: float, digits: int) -> F1:
     """Recover printed coefficients with few digits from their exact in-plane form on two planes.
 
-    It starts with the highest power of Z: the two planes determine its coefficient as if the lower powers were zero; the coefficient is
-    rounded to the printed digits and subtracted. This works while lower powers contribute less than the rounding, as in a minimum-norm
-    solution far from Z = 0. beta_0 falls below the rounding of float64, and only its order of magnitude is right.
+    The method starts with the highest power of Z. The two planes determine its coefficient as if the lower powers were zero; the
+    coefficient is rounded to the printed digits and subtracted. This works while lower powers contribute less than the rounding, as in a
+    minimum-norm solution far from Z = 0. beta_0 falls below the rounding of float64, and only its order of magnitude is right.
 
     Parameters
     ----------

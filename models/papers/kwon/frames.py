@@ -117,7 +117,7 @@ def checked_frame(name: str, frame: F2) -> F2:
     Raises
     ------
     ValueError
-        It has another shape, is not finite, scales, shears or mirrors (by more than 1e-6), or its last row is not 0 0 0 1.
+        The matrix has another shape, is not finite, scales, shears or mirrors (by more than 1e-6), or its last row is not 0 0 0 1.
     """
     t = np.asarray(frame, dtype=np.float64)
     if t.shape != (4, 4):

@@ -46,7 +46,7 @@ class Geometry:
     """Geometry of the machine: three linear drives, three links of constant length, a platform that only translates (Kwon 2.1, Fig. 2).
 
     Base frame: origin in the base plane at the middle of the drives, z up, drive 1 along +x. A drive moves its joint by ``lambda`` TOWARDS
-    the origin. One number for a parameter of the legs holds for all legs.
+    the origin. A single number for a parameter of the legs holds for all legs.
 
     Parameters
     ----------
@@ -64,7 +64,7 @@ class Geometry:
     Raises
     ------
     ValueError
-        A value is not finite, a shape does not fit, or a length that must be positive is not.
+        A value is not finite, a shape does not fit, or a length that must be positive is zero or negative.
     """
 
     R_mm: F1
@@ -172,7 +172,7 @@ def _in_plan(angle_rad: F1) -> F2:
 def forward(geometry: Geometry, lambda_mm: F2) -> F2:
     """Return the ball centre for commands of the drives: the intersection of three spheres, above their centres.
 
-    It is exact for different legs. For equal dz it is (4) with the factor 1/2 that the paper lost.
+    The result is exact also for legs that differ. For equal dz it is (4) with the factor 1/2 that the paper lost.
 
     Parameters
     ----------

@@ -22,13 +22,13 @@ IN_PLANE: tuple[Exponents, ...] = tuple(
 )
 """The ten monomials of X and Y."""
 MOST_PLANES = 3
-"""Largest number of planes to look for: four determine a full cubic anyway, fewer do not."""
+"""Largest number of planes to look for: four planes determine a full cubic, fewer do not."""
 NO_SLOPE = 1e-12
 """Slopes up to this size are rounding and count as zero."""
 STEEPEST = 1.0 + 1e-9
-"""A plane faces a coordinate whose slopes over the other two are at most this; every plane faces at least one."""
+"""A plane faces a coordinate if its slopes over the other two coordinates are at most this; every plane faces at least one coordinate."""
 RANK_TOLERANCE = 1e-3
-"""Singular values below this share of the largest do not count: the coefficient would be a thousand times less certain than a reading."""
+"""Singular values below this share of the largest do not count: a coefficient would be a thousand times less certain than a reading."""
 FLATNESS = 5e-3
 """Default tolerance of a plane, as a share of the second largest half width of X, Y, Z: 5 um for a square of +-1 mm. A stage with errors of
 1 um leaves its plane, but so little height gives no information: an error of 10 um per mm of height changes by 0.05 um over it."""
@@ -179,7 +179,7 @@ def _levels(offset_mm: F1, tolerance_mm: float, count: int) -> tuple[float, ...]
 
 @dataclass(frozen=True)
 class Layout:
-    """Arrangement of points, and the terms that it allows to fit.
+    """Arrangement of points, and the terms that can be fitted to them.
 
     Attributes
     ----------
@@ -193,7 +193,7 @@ class Layout:
         Range of X, Y, Z.
     terms : tuple of (i, j, k)
         Monomials to fit. On h parallel planes: those whose power of the coordinate normal to the planes is below h (one plane normal to Z:
-        the ten in X, Y). Otherwise all 20. Points on other surfaces (crossing planes, a sphere) get all 20 but do not determine them.
+        the ten in X, Y). Otherwise all 20, which points on other surfaces (crossing planes, a sphere) do not determine.
     tolerance_mm : float
         Largest distance of a point from its plane.
     """
@@ -239,12 +239,12 @@ class Layout:
 
 
 def layout(points_mm: F2, tolerance_mm: float | None = None) -> Layout:
-    """Analyse where points lie and which terms they allow to fit.
+    """Analyse the arrangement of points, and the terms that can be fitted to them.
 
     Parameters
     ----------
     points_mm : array, shape (n, 3)
-        Where the errors were measured (commanded positions).
+        Commanded positions at which the errors were measured.
     tolerance_mm : float, optional
         Largest distance of a point from its plane along the axis; default: FLATNESS times the second largest half width.
 

@@ -35,7 +35,7 @@ class Anova:
         rank - 1 and N - rank.
     f, p : float
         (ss_reg/df_reg) / (ss_res/df_res), and the probability of a larger F by chance. The paper wrongly calls F the ratio of residual to
-        regression. Without residual they are infinite and 0; if the values do not vary both are NaN (`undefined`).
+        regression. Without residual, F is infinite and p 0; if the values do not vary, both are NaN (`undefined`).
     r2 : float
         ss_reg / (ss_reg + ss_res); 0 if the values do not vary.
     """
@@ -109,7 +109,7 @@ def anova(values: F1, fitted: F1, rank: int) -> Anova:
 
 
 def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_tot: float | None = None) -> Anova:
-    """Return the analysis of variance of given sums, e.g. printed ones; the default total is their sum.
+    """Return the analysis of variance of given sums, e.g. printed ones; the default of the total is the sum of the others.
 
     Raises
     ------
@@ -148,7 +148,7 @@ class SurfacePrediction:
     Attributes
     ----------
     value, u_surface, u_reading : array, shape (n,)
-        Value, its standard uncertainty, and that of a new reading there, which adds the residual scatter.
+        Value, its standard uncertainty, and the standard uncertainty of a new reading there, which includes the residual scatter.
     """
 
     value: F1
@@ -207,8 +207,8 @@ class SphereSurface:
         ----------
         points_mm : array, shape (n, 3)
         margin : float
-            Allowed distance of X and Y outside the measured range, as a share of its half width (Z too, if the planes face X or Y). There
-            is no margin across the planes or in height, where nothing was measured.
+            Allowed distance of X and Y outside the measured range, as a share of the range's half width (also of Z, if the planes face X or
+            Y). There is no margin across the planes or in height, where nothing was measured.
 
         Raises
         ------

@@ -109,7 +109,7 @@ def length_random_error_mm(kind: PahkType, ends_mm: F2, random: tuple[RandomErro
     ends_mm : array, shape (2, 3)
         Commanded start and end.
     random : two RandomErrors
-        At start and end, with the same coverage; equal for squareness and for axes at rest.
+        Random errors at start and end, with the same coverage; equal for squareness and for axes at rest.
     probe_mm : array, shape (3,), optional
 
     Returns
@@ -177,7 +177,7 @@ def squareness_diagonals_mm(type_name: str, volume_mm: F1, squareness_rad: F1) -
 def best_assignment(type_name: str, volume_mm: F1, squareness_rad: F1, diagonals_mm: Sequence[float]) -> tuple[float, dict[str, float]]:
     """Return the smallest misfit between four diagonal deviations in unknown order and three squareness errors.
 
-    It tries all 24 orders and both signs of the angles. Each trial computes squareness by the scale-free contrasts
+    All 24 orders and both signs of the angles are tried. Each trial computes squareness by the scale-free contrasts
     (`abbe.models.solvers.step_diagonal.squareness_contrast`).
 
     Parameters
@@ -190,7 +190,7 @@ def best_assignment(type_name: str, volume_mm: F1, squareness_rad: F1, diagonals
     Returns
     -------
     misfit_rad, order
-        Root of the sum of the squared differences from the given squareness in the best trial, and its diagonals by name.
+        Root of the sum of the squared differences from the given squareness in the best trial; diagonals of this trial by name.
     """
     volume = np.asarray(volume_mm, dtype=np.float64)
     c0y, b0z, a0z = iso_squareness(pahk_type(type_name), squareness_rad)

@@ -1,7 +1,7 @@
 """Parameter-offset (Abbe) transformation of all ten types from one derivation (P (9), (10), (A3), (A6), (A9)).
 
-An instrument cannot stand at the origin. Along axis j it measures the deviation on the line through (Xo, Yo, Zo), which contains the
-functions of the axis AND angular errors times levers. Rule G (docs/explanation/conventions.md) gives this deviation for any chain. It is
+An instrument cannot stand at the origin. Along axis j it measures the deviation on the line through (Xo, Yo, Zo). This deviation contains
+the functions of the axis AND angular errors times levers. Rule G (docs/explanation/conventions.md) gives it for any chain. Rule G is
 linear, so the part caused by angular errors alone can be subtracted; the rest refers to the origin. One function thus replaces ten printed
 sets of rules, which have errata: missing slopes m[.], a missing XoEy(Y) in (A3), wrong signs in (A6), (A9).
 """
@@ -35,9 +35,9 @@ class OffsetSetup:
     probe_mm : array, shape (3,)
         Probe offset (Xp, Yp, Zp).
     table_point_mm : array, shape (3,), optional
-        Position, in the workpiece frame, of a reflector fixed on the table. Lines of workpiece-side axes then refer to it (less the travel
-        of carriages nearer the workpiece), which removes the terms "own travel x own angle". By default, and always for lines of tool-side
-        axes, the functional point is the probe tip.
+        Position, in the workpiece frame, of a reflector fixed on the table. Lines of workpiece-side axes then refer to the reflector (less
+        the travel of carriages nearer the workpiece), which removes the terms "own travel x own angle". By default, and always for lines of
+        tool-side axes, the functional point is the probe tip.
 
     Raises
     ------
@@ -143,8 +143,8 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
 def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
     """Return the corrections of values measured off the origin: the Abbe terms of P (9), (10), (A3), (A6), (A9).
 
-    They depend on the angular errors only, and come from rule G. Errata of the printed sets: they lack the slope terms of squareness, and
-    have wrong signs in (A6), (A9).
+    The corrections come from rule G and depend only on the angular errors. Errata of the printed sets: missing slope terms of squareness,
+    wrong signs in (A6), (A9).
 
     Parameters
     ----------
@@ -169,7 +169,7 @@ def offset_terms(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, st
 def refer_to_origin(kind: PahkType, measured: ParameterTables, setup: OffsetSetup, still_rad: F2 | None = None) -> ParameterTables:
     """Refer parameters measured on offset lines to the origin, by adding `offset_terms` (P (9), (10), (A3), (A6), (A9)).
 
-    It inverts `as_measured` for positioning that is zero at the start and straightness without a least-squares line. Arguments, units,
+    This inverts `as_measured` for positioning that is zero at the start and straightness without a least-squares line. Arguments, units,
     signs and errors are those of `as_measured`.
     """
     terms = offset_terms(kind, measured, setup, still_rad)

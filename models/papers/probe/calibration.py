@@ -39,8 +39,8 @@ def map_of_pattern(directions_rad: F2, values_mm: F1, tolerance_rad: float = ROU
     Raises
     ------
     ValueError
-        Shapes do not agree, a number is not finite, the tolerance is not above 0 and below pi/4, or the directions form no such pattern: a
-        node or the pole has no touch or more than one.
+        Shapes do not agree, a number is not finite, the tolerance is not between 0 and pi/4, or the directions do not form such a pattern:
+        a node or the pole has no touch or more than one.
     """
     angles, values = np.asarray(directions_rad, dtype=np.float64), np.asarray(values_mm, dtype=np.float64)
     if angles.ndim != 2 or angles.shape[1] != 2 or values.shape != angles.shape[:1]:
@@ -240,8 +240,8 @@ def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
 class ProbeCalibration:
     """Calibration of a probe on a master sphere.
 
-    ``probe_mm`` is the lobing at the touched directions, positive if the reading is too near the centre of the sphere. It does not contain
-    the four functions `ABSORBED`: parts of the true lobing in nx, ny, nz move the fitted centre, a constant part changes the radius.
+    ``probe_mm`` is the lobing at the touched directions, positive if the reading is too near the centre of the sphere. The four functions
+    `ABSORBED` are missing in it: parts of the true lobing in nx, ny, nz move the fitted centre, a constant part changes the radius.
 
     Parameters
     ----------

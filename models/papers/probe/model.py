@@ -210,7 +210,7 @@ def probe_error_mm(lobing: LobingMap, frame: F3, outward: F2) -> F1:
 def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
     """Return actual minus reading of the ball centre from geometry and probe, delta + Probe n.
 
-    A positive Probe means a reading too near the part, so it moves the corrected ball centre outward.
+    A positive Probe means a reading too near the part, so the correction moves the ball centre outward.
 
     Parameters
     ----------
@@ -233,7 +233,7 @@ def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
 
 
 def printed_eq17_mm(deviation_mm: F2, probe_mm: F1, outward: F2, m: Reading17) -> F2:
-    """Evaluate P (17), delta - Probe M, for either meaning of M; the paper does not say which it means.
+    """Evaluate P (17), delta - Probe M, for either meaning of M, because the paper does not state which one it means.
 
     ``"approach"`` (M = -n) equals `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way. The probe error is that of
     the outward direction in both cases.

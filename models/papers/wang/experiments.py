@@ -118,7 +118,7 @@ def readings(plan: WangPlan, deviation: Deviation, tilt_rad: dict[str, F1]) -> F
 def distance_errors_mm(points_mm: F2, model_mm: F2, machine_mm: F2) -> F1:
     """Return the distances between all pairs of points by a model minus those of the machine, shape (n (n - 1) / 2,), mm.
 
-    They do not depend on the frame, so volumetric maps can be compared without removing a rigid motion.
+    Distances do not depend on the frame, so volumetric maps can be compared without removal of a rigid motion.
 
     Parameters
     ----------

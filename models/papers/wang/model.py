@@ -263,8 +263,8 @@ def reading_mm(points_mm: F2, mirror: F1, beam: F1) -> F1:
 def step_readings_mm(path_mm: F2, deviation_mm: F2, beam: F1, mirror: F1) -> F1:
     """Return the displayed deviation of a diagonal test: reading since the first record minus nominal displacement, shape (n,).
 
-    It is exact: `reading_mm` of the moved mirror less the nominal displacement, (4) and (5) for a square mirror. Both parts are computed so
-    that the rounding error is relative to the deviation, not to the displacement.
+    The result is exact: `reading_mm` of the moved mirror less the nominal displacement, (4) and (5) for a square mirror. Both parts are
+    computed so that the rounding error is relative to the deviation, not to the displacement.
 
     Parameters
     ----------
@@ -291,7 +291,7 @@ def step_readings_mm(path_mm: F2, deviation_mm: F2, beam: F1, mirror: F1) -> F1:
 def tilt_bias_eq7(inc_mm: F1, tilt: dict[str, F1]) -> F2:
     """Return the bias by tilted mirrors of each interval of (7), shape (3 directions i, 3 axes a), mm per step.
 
-    It is linear in position: false scale and squareness errors of the size of the tilt.
+    The bias is linear in position: false scale and squareness errors of the size of the tilt.
 
     Parameters
     ----------
@@ -306,7 +306,7 @@ def tilt_bias_eq7(inc_mm: F1, tilt: dict[str, F1]) -> F2:
 
 
 def tilt_closure_mm(inc_mm: F1, tilt: dict[str, F1]) -> F1:
-    """Return the contribution of tilted mirrors to ppp - npp - pnp - ppn per axis, mm, shape (3,), by which the closure test finds them."""
+    """Return the contribution of tilted mirrors to the closure ppp - npp - pnp - ppn per axis, mm, shape (3,), which reveals them."""
     return np.asarray(inc_mm * (tilt["ppp"] - tilt["npp"] - tilt["pnp"] - tilt["ppn"]))
 
 

@@ -79,7 +79,7 @@ def bias_eq13(scale: F1, length_mm: F1) -> AcuteSquareness:
     Returns
     -------
     AcuteSquareness
-        Subtract it from `squareness_eq13_printed`; rad, acute positive.
+        Bias to be subtracted from `squareness_eq13_printed`; rad, acute positive.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def sum_test_mm(totals_mm: dict[str, float]) -> float:
 def common_scale(totals_mm: dict[str, float], length_mm: F1) -> float:
     """Return the only scale error that plain diagonals determine: sum(X_i² e_i) / R², the relative length error of the mean diagonal.
 
-    It is not in the paper, whose (12) neglects scale errors.
+    The paper does not have this result, because its (12) neglects scale errors.
 
     Parameters
     ----------
@@ -145,7 +145,7 @@ def abbe_and_spurious_eq7(n: int, inc_mm: F1, x_step_rad: F1, y_step_rad: F1) ->
     -------
     array
         First order. The Abbe terms at mid volume are real; terms with (n + 2 - 2j), (n + 1 - 2j), (2j - n - 1) or j, j being the number of
-        the interval, are spurious: the machine has these errors nowhere.
+        the interval, are spurious: the machine does not have these errors anywhere.
 
     Raises
     ------
@@ -200,7 +200,7 @@ def false_straightness_mm(length_mm: float, total_yaw_rad: float) -> float:
 def closure_of_angles_mm(inc_mm: F1, x_step_rad: F1) -> float:
     """Return the closure of one X interval by rotations of X, X (Y az - Z ay) / R; not in the paper.
 
-    It has the size of one step only, so the closure test does not find angular errors.
+    This closure has the size of one step only, so the closure test does not find angular errors.
 
     Parameters
     ----------

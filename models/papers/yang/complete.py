@@ -57,7 +57,7 @@ def delta_eq1(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
 def difference_eq3(errors: YangErrors, slide_mm: F2, tool_mm: F1) -> F2:
     """Return the complete minus the simplified model, (3), shape (n, 3), mm.
 
-    It is (1) without the three positioning errors delta_jj and the three squareness errors. Parameters are those of `delta_eq1`.
+    The difference is (1) without the three positioning errors delta_jj and the three squareness errors. Parameters: those of `delta_eq1`.
     """
     d = errors.d.copy()
     d[:, range(3), range(3)] = 0.0

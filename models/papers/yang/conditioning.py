@@ -1,4 +1,4 @@
-"""Yang and Kim's six-parameter model and its fit, (2) and (9), and how well one ball-bar test determines its parameters.
+"""Yang and Kim's six-parameter model and its fit, (2) and (9), and the conditioning of its parameters in one ball-bar test.
 
 Erratum: (2), (4), (8), (9) use the z of the slide as a workpiece coordinate, but by (1) the workpiece coordinate is -z. With readings of a
 real machine the printed matrix gives dzz, Sxz and Syz the wrong sign. The default here (``z_convention="slide"``) is correct.

@@ -1,7 +1,7 @@
 """Difference of two volumetric models over the working volume, with the confidence interval of the mean (Yang and Kim 2.2, Table 1).
 
-The paper draws 100 random points, takes mean and standard deviation, and repeats that 100 times; its interval is x ± t s / sqrt(N) with
-N = 10 000. Its text names Student's t, but its figures result from 1.96 of the normal distribution; both are available by name. The mean of
+The paper draws 100 random points, takes mean and standard deviation, and repeats this 100 times; its interval is x ± t s / sqrt(N) with
+N = 10 000. The text names Student's t, but the figures result from 1.96 of the normal distribution; both are available by name. A mean of
 standard deviations is too small (by 20 % for repeats of two points): "student" pools variances, "normal" averages as the paper does.
 """
 

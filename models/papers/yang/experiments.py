@@ -1,4 +1,4 @@
-"""Experiments on Yang's machine as least-squares problems: how well each could determine the 21 error functions.
+"""Experiments on Yang's machine as least-squares problems, to compare how well they could determine the 21 error functions.
 
 The experiments are ball-bar helices about one or several cups, step diagonals with a flat mirror, plain diagonals, and whole vector maps,
 with or without unknowns of the set-up. Coefficients are those of `abbe.models.papers.yang.complete.monomial_errors`. The number and
@@ -25,7 +25,7 @@ Problem = tuple[F2, F2]
 """The two parts of a design matrix: columns of the machine's coefficients and columns of the set-up's unknowns."""
 BAR_POINTS = 63
 MAP_NODES = 7
-"""Nodes per axis of a whole vector map; the rank does not depend on it, and the effective rank hardly does."""
+"""Nodes per axis of a whole vector map; the rank does not depend on their number, and the effective rank hardly does."""
 LONG_TOOL_MM = np.array([0.0, 0.0, 250.0])
 LATERAL_TOOL_MM = np.array([100.0, 50.0, 150.0])
 """Second and third tool of the vector maps: a longer one, and one with a lateral offset."""
@@ -217,7 +217,7 @@ EXPERIMENTS: dict[str, Experiment] = {
 
 @dataclass(frozen=True, slots=True)
 class OriginFit:
-    """Result of `hemisphere_fits`: how far the hemisphere leaves the travel at each end of each axis (0 inside), mm, shape (3, 2)."""
+    """Result of `hemisphere_fits`: overhang of the hemisphere beyond the travel at each end of each axis (0: inside), mm, shape (3, 2)."""
 
     over_mm: F2
 
