@@ -223,7 +223,8 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
 def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
     """Reduction of chi-square by one pick; ``rows`` project out other picks.
 
-    The gain needs double precision: where the projection leaves little of a column, single precision would change thousands by several.
+    The gain needs double precision: where the projection leaves little of a column, single precision would cause errors of several units
+    in a gain of thousands.
     """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))

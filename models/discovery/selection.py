@@ -24,18 +24,18 @@ from abbe.models.effects.path import Path
 SWEEPS = 2
 EVALUATIONS = 9
 NEAR = 0.02
-"""A structure without a name is refined within this fraction of its parameters' range on both sides of the start."""
+"""A structure without a name is refined within this fraction of its parameters' range on either side of the start."""
 MOST_EFFECTS = 5
 SHORTLIST = 6
 THRESHOLD = 4.0
-"""Price of every new name, beside those for its parameters and for the number of names tried."""
+"""Price of every new name, in addition to the prices for its parameters and for the number of names tried."""
 UNNAMED_PRICE = 6.0
 VARIANT_PRICE = 4.0
 """Price of a name that contains a simpler one (`abbe.models.effects.effect.Effect.variant_of`), equal to the price of a new name."""
 FORM_LEAST = 0.0002
 """A form (`Form`) must explain at least this share of its effect's gain; a smaller one would only shift the strength."""
 NEARLY = 0.93
-"""A name that explains this share of the gain of a structure without a name is preferred to it."""
+"""A name is preferred to a structure without a name if it explains this share of the structure's gain."""
 HOPELESS = 0.5
 """A start that gains less than this share of the best name so far is not refined."""
 UNNAMED_LABELS = 40
@@ -43,12 +43,12 @@ UNNAMED_LABELS = 40
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """Price of a form (`Form`) of a chosen effect: this share of the price of its columns, plus a constant."""
 APART = 0.06
-"""Least relative distance of a second effect's parameter from that of the first, and from the harmonics of this."""
+"""Least relative distance of a second effect's parameter from that of the first effect and from its harmonics."""
 SIDE_BAND = 0.03
-"""A second wave nearer to the first than twice `APART`, with less than this share of its score, is a side band: the first wave's amplitude
-changes along the axis in another way than its forms allow."""
+"""A second wave nearer to the first than twice `APART`, with less than this share of the first's score, is a side band: the first wave's
+amplitude changes along the axis in another way than its forms allow."""
 UNSURE = 3.84
-"""A moment is not excluded if its chi-square gain is lower than the best by at most this (95 %)."""
+"""A moment is not excluded if its chi-square gain is at most this much below the best (95 %)."""
 EXCLUDED = 12.0
 """A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8
@@ -59,8 +59,8 @@ KIN = 0.02
 def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
     """Optimise the non-linear parameters of ``pick`` one after the other; return the pick and its gain.
 
-    Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name. Where the readings
-    do not tell a parameter of a name, it takes its usual value (`Parameter.prior_sd`).
+    Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name. A parameter of a
+    name that the readings do not determine takes its usual value (`Parameter.prior_sd`).
     """
     best = gain_of(problem, pick, rows)
     if not pick.effect.shape:
@@ -142,7 +142,7 @@ class Contest:
     """The search over one problem: its banks of candidates, and the numbers of labels and readings.
 
     ``widths``: argument ``logs`` of `price`, by label.
-    ``seconds``: effects that are tried only beside another one (`abbe.models.effects.effect.Effect.beside`).
+    ``seconds``: effects that are tried only together with another effect (`abbe.models.effects.effect.Effect.beside`).
     """
 
     problem: WhitenedProblem
@@ -154,7 +154,7 @@ class Contest:
 
     @classmethod
     def of(cls, problem: WhitenedProblem, effects: Sequence[Effect]) -> Contest:
-        """Set up a search for all effects on the mean of the readings that the present simulation lacks.
+        """Set up a search for all effects that change the mean of the readings and that the present simulation lacks.
 
         Each effect is tried with every combination of its start values (`starts_of`).
         """
@@ -165,9 +165,9 @@ class Contest:
         return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(np.count_nonzero(problem.use)), seconds)
 
     def look_for_more(self, picks: Sequence[Pick], rows: F2) -> None:
-        """Add to the search the effects that are only tried beside ``picks``, and structures without a name.
+        """Add to the search the effects that are tried only together with ``picks``, and structures without a name.
 
-        The latter start at the peaks of the residuals after projection by ``rows``, which project out the picks.
+        These structures start at the peaks of the residuals after projection by ``rows``, which project out the picks.
         """
         problem = self.problem
         left = problem.projection.residual - rows.T @ (rows @ problem.projection.y)
@@ -240,9 +240,10 @@ class Contest:
 
 
 def _second(effect: Effect, pick: Pick, paths: Sequence[Path]) -> Effect:
-    """Return an effect tried beside ``pick``, with its key, and with starts for these runs.
+    """Return an effect that is tried together with ``pick``, with the same key and with starts for these runs.
 
-    A moment starts between runs and within them (`moments`); a value that the pick has too, not near its value or harmonics.
+    Starts of a moment lie between runs and within them (`moments`); starts of a parameter that the pick also has are not near the pick's
+    value and its harmonics.
     """
     shape = []
     for q in effect.shape:
@@ -288,7 +289,7 @@ def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
 
 
 def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Refine every pick again given the others, and replace it by another label if that scores higher."""
+    """Refine every pick again given the others, and replace it by another label with a higher score."""
     if len(picks) < 2:
         return picks
     for i in range(len(picks)):
@@ -301,7 +302,7 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 
 
 def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Replace two picks of the same effect by a third where it scores higher: a lag of Y looks much like equal leads of X and Z."""
+    """Replace two picks of the same effect by a third pick that scores higher: a lag of Y looks much like equal leads of X and Z."""
     for i, j in combinations(range(len(picks)), 2):
         a, b = picks[i], picks[j]
         if a.effect.name != b.effect.name or a.unnamed:
@@ -366,7 +367,7 @@ def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
 
 @dataclass(frozen=True)
 class Rival:
-    """A name that could replace a chosen one. ``deficit``: how much lower its score is; ``share``: its gain over that of the chosen one."""
+    """A name that could replace a chosen one. ``deficit``: the chosen score minus its score; ``share``: its gain over the chosen gain."""
 
     pick: Pick
     deficit: float

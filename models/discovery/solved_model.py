@@ -22,7 +22,7 @@ LONGEST_STEP = 0.3
 
 @dataclass(frozen=True)
 class SolvedModel:
-    """Unknowns of the simulation and of the effects, fitted together to the identify runs; usual sizes of errors are the priors.
+    """Unknowns of the simulation and of the effects, fitted together to the identify runs, with usual sizes of errors as priors.
 
     Attributes
     ----------
@@ -148,7 +148,7 @@ def _spread(columns: Sequence[F2], identified: Sequence[bool], c: F1) -> F1:
 
 
 def free_columns(run: CaseRun, fitted_setups: set[str]) -> F2:
-    """Return columns of the unknowns fitted to the run itself: zero of a laser, or cup and bar length of a set-up without identify runs."""
+    """Return columns of the unknowns fitted to the run itself: a laser's zero; cup and bar length of a set-up without identify runs."""
     p = run.path
     if p.kind == "laser":
         return np.ones((p.n, 1))

@@ -1,4 +1,4 @@
-"""Declaration of a physical effect: everything that discovery, reports and the self-test need to know of it."""
+"""Declaration of a physical effect: everything that discovery, reports and the self-test need to know about the effect."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from abbe.models.effects.path import Path
 Values = Mapping[str, float]
 """Values of the non-linear parameters of an effect, by name."""
 Signal = Callable[[tuple[Path, ...], str, Values], list[F2]]
-"""From runs, key and non-linear parameters to one array (n, k) per run: mm per unit of each of k coefficients. Runs that cannot show the
+"""Maps runs, key and non-linear parameters to one array (n, k) per run: mm per unit of each of k coefficients. Runs that cannot show the
 effect get zeros."""
 Family = Literal["drive", "structure", "thermal", "instrument", "geometry"]
 Remedy = Literal["table", "control parameter", "mechanics", "warm up or sensor", "set-up"]
-"""What removes an effect: a compensation table, a parameter of the control, a fitter's work, temperature control, a better set-up."""
+"""Way to remove an effect: a compensation table, a parameter of the control, a fitter's work, temperature control, a better set-up."""
 
 PRIOR_SHARE = 0.3
 """Standard uncertainty of a non-linear parameter before any reading, as a share of its range, about as for a uniform distribution."""
@@ -60,11 +60,11 @@ class Effect:
     name : str
         E.g. ``"backlash"``; the label is ``name:key`` or, without keys, the name alone.
     title : str
-        The field's term, for people.
+        The usual technical term, for people.
     family : Family
-        Part of the machine to which it belongs.
+        Part of the machine to which the effect belongs.
     keys : tuple of str
-        Axes, components or planes at which it may occur; ``("",)`` if it has no key.
+        Axes, components or planes at which the effect may occur; ``("",)`` if it has no key.
     unit : str
         Unit of the strength: ``"um"``, ``"urad"``, ``"ms"``, ``"K"``, ``"K/h"`` or ``"mrad"``.
     per_unit : float
@@ -82,24 +82,24 @@ class Effect:
     signature : str
         How the effect looks in the readings.
     remedy, remedy_text : Remedy, str
-        What removes it, in one word and as advice to the operator.
+        Remedy in one word, and as advice to the operator.
     source : str
         Paper, standard or model behind it.
     forms : tuple of Form
     unseen : tuple of float
-        Ratio of the whole strength to that of the columns, and its standard uncertainty. It differs from 1 where the present model absorbs
-        a part of the effect (e.g. the line of a straightness); the stated strength includes this part.
+        Ratio of the whole strength to that of the columns, and its standard uncertainty. The ratio differs from 1 if the present model
+        absorbs a part of the effect (e.g. the line of a straightness); the stated strength includes this part.
     kind : "mean" | "variance"
-        Whether it shifts the readings or makes them noisier (stick-slip, vibration with an unknown phase, outliers). The columns of a
+        Whether the effect shifts the readings or adds noise (stick-slip, vibration with an unknown phase, outliers). The columns of a
         "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.
     absorbed_by : tuple of str
-        Entries of ``current_model.includes``: with any of them, the present model contains the effect, which is then no candidate.
+        Entries of ``current_model.includes``: with any of them, the present model contains the effect, so that it is not a candidate.
     blind : tuple of str
-        Tests that cannot show it.
+        Tests that cannot show the effect.
     variant_of : str
-        Name of a simpler effect which this one contains. It replaces the simpler one only on clear evidence.
+        Name of a simpler effect that this effect contains. This effect replaces the simpler one only on clear evidence.
     beside : tuple of str
-        Names of effects. This one is tried only if one of them was found at the same key; empty: always.
+        Names of other effects. This effect is tried only if one of them was found at the same key; empty: always.
     separated_by : dict
         Maps a rival (name, or name:key) to the tests that separate the two (``next_test.adds``).
     """

@@ -171,7 +171,7 @@ def _fits(machine: Machine, centre_mm: F1, radius_mm: float) -> bool:
 
 
 def _bar(like: Path, q_mm: F2, feed_mm_min: float, t_set_s: float, label: str, centre_mm: F1 | None = None) -> CaseRun:
-    """Return a ball-bar run over some of the given positions (about `READINGS`), in a set-up of its own."""
+    """Return a ball-bar run over some of the given positions (about `READINGS`), in a separate set-up."""
     q = q_mm[:: max(len(q_mm) // READINGS, 1)]
     centre = like.centre_mm if centre_mm is None else centre_mm
     way = np.linalg.norm(np.diff(q, axis=0, prepend=q[:1]), axis=1).cumsum()
@@ -278,7 +278,7 @@ def _angles(like: Path, start: float) -> ExperimentOffer:
 
 
 def _late(known: list[Path], start: float) -> ExperimentOffer:
-    """Offer to repeat the first paths hours later, each in a set-up of its own."""
+    """Offer to repeat the first paths hours later, each in a separate set-up."""
     runs = []
     for k, p in enumerate(_different(known)[:4]):
         runs.append(_again(p, start + LATE_S + 1500.0 * k, f"next_late_{k}", p.machine))

@@ -18,13 +18,13 @@ def jump(at: Places, key: str, values: Values) -> F3:
 
 
 def _settling(at: Places, key: str, values: Values) -> F3:
-    """Return a jump that takes some travel of the axis, one column per length in `SETTLING_MM`."""
+    """Return a jump that is spread over some travel of the axis, one column per length in `SETTLING_MM`."""
     a = axis_of(key)
     return along(direction_of(key), *(0.5 * UM * at.sign[:, a] * np.exp(-at.since_mm[:, a] / d) for d in SETTLING_MM))
 
 
 def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return a jump that changes along the guide, worn at one end or in the middle."""
+    """Return a jump that changes along the guide, because the guide is worn at one end or in the middle."""
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     half = 0.5 * UM * at.sign[:, a]
