@@ -163,7 +163,7 @@ class ProbeState:
 
 @dataclass(frozen=True, slots=True)
 class Latch:
-    """Axis position at which the probe tripped, and when, microseconds of the controller's clock.
+    """Axis position at which the probe tripped, and the time of the trip, microseconds of the controller's clock.
 
     ``period_s``: period at which the control reads the probe; the trip was up to one period earlier. 0: the probe latches by itself.
     """

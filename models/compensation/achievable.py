@@ -361,7 +361,7 @@ def achievable(
 
 @dataclass(frozen=True, eq=False)
 class _ResidualJudge:
-    """Judge of all kinds of table, by the same pairs, sources of uncertainty and unit."""
+    """Judges all kinds of table by the same pairs, sources of uncertainty and unit."""
 
     solution: JointSolution
     pairs: Pairs

@@ -137,7 +137,7 @@ def _quarter_turn(
 
 
 def _disagreement(runs: tuple[RunData, ...]) -> float:
-    """Sum of squares by which the forms in the runs differ, each without its best-fit affine map; the machine adds the same to each."""
+    """Sum of squares of the differences between the forms in the runs, without best-fit affine maps; machine errors hardly add to it."""
     seen: dict[tuple[str, int], list[float]] = {}
     for p, deviation in ((r.points, r.deviation_mm) for r in runs if r.points is not None and r.points.source != "length"):
         for k in np.unique(p.component):
