@@ -261,7 +261,7 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why this may be wrong (empty: the tool shows it)."""
+    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it may be wrong (empty: the tool shows it)."""
 
     axis: int
     side: int
