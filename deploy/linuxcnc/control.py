@@ -83,7 +83,8 @@ class Control:
         s = self._status
         # The planner is done some servo periods before the joints are: what they are told counts.
         still = all(self._get(f"joint.{n}.vel-cmd") == 0.0 for n in range(JOINTS))
-        idle = s.state == linuxcnc.RCS_DONE and s.interp_state == linuxcnc.INTERP_IDLE and s.echo_serial_number >= self._sent
+        over = s.state in (linuxcnc.RCS_DONE, linuxcnc.RCS_ERROR)  # after a refused line the control stays in error until the next one
+        idle = over and s.interp_state == linuxcnc.INTERP_IDLE and s.echo_serial_number >= self._sent
         return Snapshot(
             estop=s.task_state == linuxcnc.STATE_ESTOP or not self._get("abbe-estop-ok"),
             drives_on=s.task_state == linuxcnc.STATE_ON,

@@ -97,9 +97,9 @@ class Instance:
             count = n_lines or int(await self._drives.stdout.readline())
             return [[float(word) for word in (await self._drives.stdout.readline()).split()] for _ in range(count)]
 
-    def halcmd(self, *words: str) -> None:
-        """What somebody at the machine's switches would do."""
-        subprocess.run(self.inside("halcmd", "-s", *words), check=True)
+    def halcmd(self, *words: str, text: str | None = None) -> None:
+        """What somebody at the machine's switches would do; ``-f`` with ``text``: many commands at once."""
+        subprocess.run(self.inside("halcmd", "-s", *words), input=text, text=True, check=True, timeout=PATIENCE_S)
 
     def faster(self, velocity_mm_s: int, acceleration_mm_s2: int) -> None:
         """Let the next start have quicker axes than the configuration's."""
