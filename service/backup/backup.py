@@ -176,7 +176,7 @@ def audit_faults(database: Path, heads: Path, key: Path | None) -> tuple[int, li
 
 
 def _records(database: Path) -> list[AuditEvent]:
-    """The audit of a copied database, whose documents are text."""
+    """Return the audit of a copied database, in which the documents are JSON text."""
     names = [one.name for one in fields(AuditEvent)]
     rows = (dict(zip(names, row, strict=True)) for row in rows_of(database, f"SELECT {', '.join(names)} FROM audit ORDER BY id"))  # noqa: S608 - our own names
     return [AuditEvent(**row | {"doc": json.loads(row["doc"])}) for row in rows]
