@@ -25,7 +25,7 @@ NOT_PRINTED = {
 }
 
 TURNS = 5.0
-"""Assumed; the paper does not print it."""
+"""Assumed number of turns; the paper does not print it."""
 
 CENTRE_MM = np.array([406.4, 0.0, -254.0])
 """Middle of the XZ bed, workpiece coordinates; the height is not printed."""
