@@ -18,7 +18,7 @@ from abbe.service.sequences.steps import Point, TouchFeature
 STEP_MM = 1.0
 """Largest distance between the places of a way that are checked."""
 LONG_MM = 200.0
-"""Length of a shaft that is not stated, and of the probe's body above it."""
+"""Assumed length of a shaft without a stated length, and of the probe's body above it."""
 ROUNDS = 28
 """Number of thirds in the search for the nearest place on a part: they find it to 1/80,000 of the part's length."""
 
