@@ -186,7 +186,7 @@ def next_step(alarm: Alarm) -> AlarmKind | None:
 
 
 def step_of_order(alarm: Alarm) -> AlarmKind:
-    """Step with which an order of a person begins now."""
+    """Return the step with which a person's order would begin now."""
     if _is_answered(alarm) or alarm.last(AlarmKind.MEASURED) is None:
         return AlarmKind.MEASURED
     return AlarmKind.DISCOVERED if alarm.last(AlarmKind.DISCOVERED) is None else AlarmKind.PROPOSED

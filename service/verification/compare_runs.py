@@ -60,7 +60,7 @@ class ComparedCurve:
 
 @dataclass(frozen=True, eq=False)
 class RunDifference:
-    """Second minus first at places that both runs read: abscissa, difference, standard uncertainty."""
+    """The second run minus the first at places that both runs read: abscissa, difference, standard uncertainty."""
 
     x: F1
     difference_um: F1
