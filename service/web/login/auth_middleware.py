@@ -102,7 +102,7 @@ class AuthMiddleware:
         if body is not None and (too_long := await body.refusal()) is not None:
             return too_long
         if need is not PUBLIC and need not in visit.principal.permissions:
-            return problem(403, f"a {visit.principal.role} may not do this: the request needs the permission {need.value!r}")
+            return problem(403, f"the role {visit.principal.role} may not do this: it needs the permission {need.value!r}")
         if changes or request.scope["type"] == "websocket":
             return self._foreign(request, visit, need, changes=changes)
         return None
