@@ -38,8 +38,9 @@ from tests.system.serve_bench import abbe, free_port
 from tests.system.test_serve_screens import SIZES, Watch, axe  # noqa: F401 - a fixture
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
-pytestmark = [pytest.mark.browser, pytest.mark.scenario, pytest.mark.timeout(1500)]
-SPEED = 50
+pytestmark = [pytest.mark.browser, pytest.mark.scenario, pytest.mark.timeout(3000)]
+SPEED = 20
+"""At 50 a busy computer answers the service too late: its status is then unknown for half a second, or readings lag behind the axes."""
 WALKS = [
     ("1280", "light", "en"), ("1280", "dark", "ja"), ("1024", "dark", "en"),
     ("1024", "light", "ja"), ("390", "light", "en"), ("390", "dark", "ja"),
@@ -58,7 +59,7 @@ table_walk_um = 200
 [web]
 port = {port}
 """
-CHECK_MS, CAMPAIGN_MS, PUSH_MS = 300_000, 900_000, 600_000
+CHECK_MS, CAMPAIGN_MS, PUSH_MS = 600_000, 1_500_000, 1_200_000
 
 
 async def _prepare(url: str, sims: Sims) -> None:
@@ -127,7 +128,7 @@ def to_the_alarm(finger: Finger) -> None:
     finger.screen("/alarm")
 
 
-@pytest.mark.skipif(not LONG, reason="three minutes a walk on a simulated machine: ABBE_TEST_LONG=1 walks the whole way")
+@pytest.mark.skipif(not LONG, reason="five to ten minutes a walk on a simulated machine: ABBE_TEST_LONG=1 walks the whole way")
 @pytest.mark.parametrize(("size", "scheme", "lang"), WALKS)
 def test_on_a_prepared_machine_a_drift_is_followed_to_the_signed_report(
     chromium: Browser,
