@@ -208,7 +208,8 @@ def sentence(check: Verification) -> str:
     """Result of a check in the reader's language; a verdict with another reason than its figures keeps its stored sentence."""
     frame = current()
     if check.cause is not None:
-        return f"{frame.translate('check.stopped')} {phrase(frame.lang, check.cause.what)}"
+        what = phrase(frame.lang, check.cause.what)
+        return f"{frame.translate('check.stopped')} {what[:1].upper()}{what[1:]}"
     verdicts = own_verdicts(check)
     named = [name for name, verdict in verdicts.items() if verdict == check.verdict]
     if not named or (check.verdict == "pass" and len(named) < len(verdicts)) or (check.verdict != "fail" and "fail" in verdicts.values()):
