@@ -16,7 +16,7 @@ from abbe.service.web.formatting import without_commands
 
 FOLDER = Path(sequences.__file__).parent
 # Their parts are filled in from a few words, or they hold the words of another error.
-COMPOSED = {"the laser's beam is {}", "feature {}: {}", "feature {}: its radius comes out {} mm too {}", "{}; then resume"}
+COMPOSED = {"the laser's beam is {}", "{}: {}", "{}: its radius comes out {} mm too {}", "{}; then resume"}
 BEAM = ("the laser's beam is lost", "the laser's beam is too weak (12 permille)")
 
 
