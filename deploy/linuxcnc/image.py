@@ -22,7 +22,7 @@ _HEADER = struct.Struct(">4HI2H3HH3i3i")
 
 
 class ImageError(ValueError):
-    """The words are no image, or an image that this control cannot reproduce."""
+    """The words are not an image, or this control cannot reproduce the image."""
 
 
 @dataclass(frozen=True)

@@ -200,7 +200,7 @@ class Motion:
         return Result.OK
 
     def touch(self, target_mm: Point, feed_mm_min: float) -> Result:
-        """Go straight to a target until the probe trips (G38.3: without a contact the target is reached, which is no error)."""
+        """Go straight to a target until the probe trips (G38.3: to reach the target without a contact is not an error)."""
         refusal = self._refusal(feed_mm_min) or self._strokes([target_mm])
         if refusal or not self.state.probe_ready or self.state.deflected:
             return refusal or Result.NO_PROBE

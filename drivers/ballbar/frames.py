@@ -42,7 +42,7 @@ _SETTINGS = struct.Struct("<HBBIi")
 
 @dataclass(frozen=True, slots=True)
 class Info:
-    """Identity of the box. ``firmware`` is BCD (0x0102 = 1.2), ``rate_hz`` 0 when it is not streaming."""
+    """Identity of the box. ``firmware`` is BCD (0x0102 = 1.2); ``rate_hz`` is 0 when the box is not streaming."""
 
     tag: int
     boot_id: int

@@ -33,7 +33,7 @@ class Described:
 
 
 def described(url: DeviceUrl, kind: Kind | None = None) -> Described:
-    """Read the device file of a URL; raises BadDeviceFile, or BadUrl if it is not of this kind."""
+    """Read the device file of a URL; raises BadDeviceFile, or BadUrl if the file describes another kind of device."""
     file, sha256 = load(described_by(url).device)
     if kind is not None and file.kind != kind:
         raise BadUrl(ascii(str(url)), "open device", f"its device file is of kind {file.kind!r}, not {kind!r}", "name another device file")

@@ -38,7 +38,7 @@ SIDE = 4
 class Constants:
     """Error of the line under a cloud of delays with a power-law distribution, in units of the 24th smallest delay, as a table.
 
-    ``shape``: estimated exponents, one per column of the table. ``bias``: how much too high the line lies in its middle. ``half``: half the
+    ``shape``: estimated exponents, one per column of the table. ``bias``: height error of the line in its middle. ``half``: half the
     width of the 95.45 % interval of the error in the middle. ``tilt``: half the width of this interval for the rise of the line from end to
     end. Simulated on 40 000 and 60 000 clouds with exponents 0.6 to 4.5 (tests/experiments/campaigns/envelope_constants.py).
     """
@@ -167,7 +167,7 @@ class ClockFit:
 
     @property
     def drift_ppm(self) -> float:
-        """By how many ppm the device's clock runs faster than the host's."""
+        """Rate of the device's clock minus that of the host's clock, ppm."""
         return (1.0 / self.rate - 1.0) * 1e6
 
     @property

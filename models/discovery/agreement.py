@@ -110,7 +110,7 @@ def _noise(problem: WhitenedProblem, kind: str) -> _Noise | None:
 def _white(
     problem: WhitenedProblem, solved: SolvedModel, root: F2, run: CaseRun, predicted_mm: F1, fitted_setups: set[str]
 ) -> tuple[F2, int]:
-    """Return columns over the valid readings of a run, and how many of the last ones are the run's own unknowns.
+    """Return columns over the valid readings of a run, and the number of the last columns that are the run's own unknowns.
 
     The first column is the whitened residual. Each other column is the effect of one standard deviation of one unknown of the prediction.
     All are whitened with the assumed noise; `_tested` applies the ratio of estimated to assumed noise.

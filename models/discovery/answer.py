@@ -52,7 +52,7 @@ class NamedEffect:
     name, key : name in the catalogue; axis or error motion that it concerns.
     strength, u_strength : strength and standard uncertainty in the effect's unit (um, urad, ms, K, K/h, mrad), signed where a sign has
         meaning.
-    parameters : non-linear parameters by name, (value, standard uncertainty); the latter is NaN where it is unknown.
+    parameters : non-linear parameters by name, (value, standard uncertainty); the uncertainty is NaN if it is unknown.
     coefficients, covariance : linear coefficients of the effect's columns and their covariance; column times coefficient is mm.
     evidence : gain in log evidence (half the chi-square) after the price of the effect.
     alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.

@@ -107,7 +107,7 @@ def design(machine: Machine, terms: tuple[Term, ...], axes_mm: F2) -> F3:
 
 
 REST_MM = 1e-8
-"""A smaller difference of two commanded positions is rounding and no motion."""
+"""A smaller difference of two commanded positions is rounding, not motion."""
 
 
 def travel_sign(axes_mm: F2) -> F2:

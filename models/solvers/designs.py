@@ -59,7 +59,7 @@ def laser_rows(field: Field, path_mm: F2, beam: F1, across: F2) -> DesignRows:
 
 
 def vector_rows(field: Field, points_mm: F2) -> DesignRows:
-    """All components of the deviation at points, the upper bound of what any instrument can determine; no set-up unknowns."""
+    """All components of the deviation at points, an upper bound for any instrument; no set-up unknowns."""
     f = field(points_mm)
     flat = f.reshape(-1, f.shape[2])
     return DesignRows(flat, np.zeros((flat.shape[0], 0)))

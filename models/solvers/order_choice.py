@@ -1,4 +1,4 @@
-"""Order of the model: the number of Legendre orders, or rigid6, that predicts readings which were left out.
+"""Order of the model: the number of Legendre orders, or rigid6, chosen by its prediction of readings left out of the fit.
 
 Whole set-ups are left out in turn; for the choice between rigid6 and 21 error motions also regions of the volume (a corner, the end of a
 stroke), because left-out set-ups mostly lie where the others measured and hardly show how a model predicts elsewhere. Each score subtracts

@@ -107,7 +107,7 @@ def _sd(machine: Machine, term: Term, p: Priors) -> float:
 SIZE_FACTOR = 3.0
 """Hyperprior of a class of unknowns: its typical size is known within this factor (one standard deviation of the logarithm)."""
 LARGEST_SIZE, SMALLEST_SIZE = 5.0, 0.07
-"""Bounds of the estimated size of a class relative to the documented one; set-ups and lost motion have no lower one."""
+"""Bounds of the estimated size of a class relative to the documented size; set-ups and lost motion have no lower bound."""
 MOTION_FACTOR = 2.5
 """Hyperprior of the size of one error motion relative to its class: known within this factor."""
 LARGEST_MOTION = 5.0

@@ -1,1 +1,1 @@
-"""Telescoping ball-bar: the instrument (device), its bytes (wire) and the line they go over (port)."""
+"""Telescoping ball-bar: the instrument (device), its bytes (wire) and their line (port)."""

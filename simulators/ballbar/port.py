@@ -58,7 +58,7 @@ class PtyPort:
         return f"serial://{path}?baud={BAUD}"
 
     def room(self) -> int:
-        """Return how many bytes the buffer can still take; 0 while unplugged."""
+        """Return the number of bytes that the buffer can still take; 0 while unplugged."""
         return 0 if self._serial is None else max(0, self._buffer_bytes - self._serial.backlog)
 
     @property
@@ -102,7 +102,7 @@ class TcpPort:
         return f"socket://127.0.0.1:{self._port}"
 
     def room(self) -> int:
-        """Return how many bytes the buffer can still take; 0 if no host is connected."""
+        """Return the number of bytes that the buffer can still take; 0 if no host is connected."""
         if self._writer is None:
             return 0
         return max(0, BUFFER_BYTES - self._writer.transport.get_write_buffer_size())

@@ -59,7 +59,7 @@ class Compensation:
         return self._owner if now_s < self._lease_end_s else 0
 
     def lease_left_ms(self, now_s: float) -> int:
-        """Return how long the lease still lasts, in milliseconds of wall time."""
+        """Return the remaining time of the lease, in milliseconds of wall time."""
         return int(1000.0 * (self._lease_end_s - now_s) / self._scale) if self.owner(now_s) else 0
 
     def lease(self, owner: int, lease_ms: int, now_s: float) -> CompResult:

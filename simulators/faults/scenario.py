@@ -8,7 +8,7 @@
     [[fault]]
     kind = "delay_reply"     # a kind that the player supports
     at = 2                   # first event of its sort that it hits, counted from 0 (requests, replies, frames, connections)
-    times = 1                # how many in a row; 0: all from there on
+    times = 1                # number of events in a row that it hits; 0: all from there on
     seconds = 0.3            # for kinds that wait
     value = 0                # for kinds that change something
     on = "any"               # only events of this sort count, e.g. "read", "write"; the player defines the sorts

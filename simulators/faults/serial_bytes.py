@@ -42,7 +42,7 @@ def cut(data: bytes) -> list[bytes]:
 
 
 def garbage(kind: str, size: int, draw: random.Random) -> bytes:
-    """Return ``size`` bytes that are no frame: ``random``, all ``ones``, ``sync`` bytes or a ``header`` with payload length 255."""
+    """Return ``size`` bytes that are not a frame: ``random``, all ``ones``, ``sync`` bytes or a ``header`` with payload length 255."""
     if kind == "random":
         return draw.randbytes(size)
     if kind == "ones":

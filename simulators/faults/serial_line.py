@@ -148,7 +148,7 @@ class FaultyLine:
         return self._terminal
 
     def room(self) -> int:
-        """Return how many bytes the buffer can still take; 0 while unplugged."""
+        """Return the number of bytes that the buffer can still take; 0 while unplugged."""
         return 0 if self._terminal is None else max(0, BUFFER_BYTES - self._terminal.backlog)
 
     def send(self, data: bytes) -> None:

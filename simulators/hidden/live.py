@@ -50,7 +50,7 @@ def live_of(config: HiddenConfig, low_mm: F, high_mm: F) -> "Live | None":
 
 
 def problem(e: Hidden) -> str | None:
-    """Return in one line what is wrong with the hidden effect of a scenario, or None."""
+    """Return in one line the fault of a scenario's hidden effect, or None."""
     if e.name not in MOVES | READS:
         known = "unknown effect" if e.name not in effect_names() else "the simulated devices do not support this effect"
         return f"hidden.name: {e.name!r}: {known}; choose one of {', '.join(sorted(MOVES | READS))}"

@@ -40,7 +40,7 @@ class BentMachine:
 
 
 class PerfectMachine(BentMachine):
-    """The same kinematics without error motions, to compute the trace of one effect quickly."""
+    """The kinematics of `BentMachine` without error motions, to compute the trace of one effect quickly."""
 
     def _motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         return np.zeros((len(position_mm), 3)), np.zeros((len(position_mm), 3))

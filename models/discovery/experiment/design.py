@@ -142,7 +142,7 @@ def _with_setups(case: Case) -> Baseline:
 
 
 def _decimated(run: CaseRun) -> tuple[CaseRun, float]:
-    """Return the run with fewer readings, and how many old readings each of them represents."""
+    """Return the run with fewer readings, and the number of old readings that each of them represents."""
     step = max(run.path.n // THIN, 1)
     p, rows = run.path, slice(None, None, step)
     a = p.at

@@ -141,7 +141,7 @@ def _low_cycles(path: Path) -> float:
 
 
 def _turns_of_bar(path: Path) -> float:
-    """Return how many turns the bar makes along a run."""
+    """Return the number of turns of the bar along a run."""
     return float(np.linalg.norm(np.diff(path.look, axis=0), axis=1).sum()) / (2.0 * np.pi)
 
 

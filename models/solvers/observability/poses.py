@@ -158,7 +158,7 @@ def _free(poses: list[_Pose], reach: float, *, scale: bool) -> F2:
 
 
 def _without_scale(whole: F2, poses: list[_Pose], count: int) -> F2:
-    """Take the scale of the artefact out of its free forms: a length is calibrated."""
+    """Take the scale of the artefact out of its free forms, because a length is calibrated."""
     places = np.zeros((count, 2))
     for p in poses:
         places[p.feature] = p.nominal
