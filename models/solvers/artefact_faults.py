@@ -150,7 +150,7 @@ def _disagreement(runs: tuple[RunData, ...]) -> float:
 
 
 def turned_run(run: RunData, quarter: int) -> RunData | None:
-    """Return a run as if the artefact lay some quarter turns further about its centre; None if a feature then lies at no feature's place."""
+    """Return a run as if the artefact lay some quarter turns further about its centre; None if a feature then lies at no other's place."""
     p = run.points
     if p is None or p.source == "length":
         return None
