@@ -49,9 +49,9 @@ class _Pending:
     points: int
     aborted: bool = False
     touch_from_mm: Point | None = None
-    """Position at which a touch began; None: the move is no touch."""
+    """Position at which a touch began; None: the move is not a touch."""
     line: str = ""
-    """G-code of a straight motion, and where it began."""
+    """G-code of a straight motion; ``from_mm``: its start."""
     from_mm: Point | None = None
     times: int = 1
 
