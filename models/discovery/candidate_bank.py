@@ -169,6 +169,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
     """Build the bank of all picks that change a reading; reuse columns of the problem's other banks in memory."""
+    picks = list({p.start: p for p in picks}.values())  # two picks beside which the same effect is tried ask for it twice
     asked = [p.start for p in picks]
     banks = [b for b in problem.banks if isinstance(b, Bank)]
     same = next((b for b in banks if list(b.known) == asked), None)

@@ -64,3 +64,10 @@ def test_another_scene_starts_without_banks(problem: WhitenedProblem) -> None:
     assert not with_projection(problem).banks
     del bank
     assert not any(isinstance(b, Bank) and len(b.known) == 3 for b in problem.banks)  # nobody else keeps it
+
+
+def test_a_pick_that_is_asked_for_twice_is_held_once(problem: WhitenedProblem) -> None:
+    """Two chosen effects may each ask for the same second one."""
+    twice, once = (bank_of(problem, picks) for picks in ([*PICKS[:5], *PICKS[:3]], PICKS[:5]))
+    same(twice, once)
+    assert list(bank_of(problem, PICKS[1:4]).known) == [p.start for p in PICKS[1:4]]  # taken over from those
