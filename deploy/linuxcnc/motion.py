@@ -12,9 +12,6 @@ FIFO_SIZE = 8192
 ALARM_NONE, ALARM_ESTOP = 0, 1
 _ARRIVED_MM = 1e-6
 _BEYOND_MM = 1e-9
-_AT_REST_US, _TIMES = 100_000, 5
-"""How long the control may rest before its motion has arrived, and how often a straight motion is then given to it. A busy computer drops
-one now and then: the control reports an error without words, and stands where it stood."""
 # Absolute, mm, mm/min, no tool offsets or cutter radius; corners blended within 1 um, and no point left out (Q0).
 _MODES = "G21 G90 G94 G17 G40 G49 G80"
 _HEADER = (_MODES, "G64 P0.001 Q0")
@@ -50,10 +47,6 @@ class _Pending:
     aborted: bool = False
     touch_from_mm: Point | None = None
     """Position at which a touch began; None: the move is not a touch."""
-    line: str = ""
-    """G-code of a straight motion; ``from_mm``: its start."""
-    from_mm: Point | None = None
-    times: int = 1
 
 
 class Motion:
@@ -81,8 +74,6 @@ class Motion:
         """Position and time at which the probe tripped in the last touch; None: it did not trip."""
         self.fifo: list[Point] = []
         self._pending: _Pending | None = None
-        self._resting_us: int | None = None
-        """Since when the control rests although the motion under way has not arrived."""
         self._path_points = 0
         control.hold(on=False)
         control.path_output(on=False)
@@ -158,26 +149,7 @@ class Motion:
             begun = self._pending.touch_from_mm
             if begun is not None and self.state.tripped and not self._pending.aborted and begun != self.state.position_mm:  # no old trip
                 self.latch = self.state.probed_mm, self._now_us()
-            self._rests(counts=arrived or self._pending.aborted or self.latch is not None)
-        else:
-            self._resting_us = None
-
-    def _rests(self, *, counts: bool) -> None:
-        """End a motion that has arrived. When the control has rested before: give it a motion again that it has not begun, else give up."""
-        now, pending = self._now_us(), self._pending
-        self._resting_us = now if self._resting_us is None else self._resting_us
-        if not counts and now - self._resting_us < _AT_REST_US:
-            return
-        if not counts and pending is not None and self._dropped(pending):
-            pending.times, self._resting_us = pending.times + 1, None
-            self._control.mdi(pending.line)
-            return
-        self._end(counts=counts)
-
-    def _dropped(self, pending: _Pending) -> bool:
-        """Whether the control stands where a straight motion began, and may have it again."""
-        again = pending.line and pending.times < _TIMES and self.state.position_mm == pending.from_mm
-        return bool(again and self.may_move() and self.hold == Hold.RUN and not (pending.touch_from_mm and self.state.deflected))
+            self._end(counts=arrived or self._pending.aborted or self.latch is not None)
 
     def _end(self, *, counts: bool) -> None:
         self.in_position_us = self.in_position_us or self._now_us()
@@ -194,9 +166,8 @@ class Motion:
         refusal = self._refusal(feed_mm_min) or self._strokes([target_mm])
         if refusal:
             return refusal
-        line = f"{_MODES} G61 {_line(target_mm)} F{feed_mm_min:.2f}"
-        self._begin(_Pending(target_mm, is_path=False, points=0, line=line, from_mm=self.state.position_mm))
-        self._control.mdi(line)
+        self._begin(_Pending(target_mm, is_path=False, points=0))
+        self._control.mdi(f"{_MODES} G61 {_line(target_mm)} F{feed_mm_min:.2f}")
         return Result.OK
 
     def touch(self, target_mm: Point, feed_mm_min: float) -> Result:
@@ -207,10 +178,9 @@ class Motion:
         zero = self._control.work_offset_mm()
         if zero is None:
             return Result.BAD_ARGUMENT
+        self._begin(_Pending(target_mm, is_path=False, points=0, touch_from_mm=self.state.position_mm))
         x, y, z = (t - o for t, o in zip(target_mm, zero, strict=True))
-        line, here = f"{_MODES} G61 G38.3 X{x:.9f} Y{y:.9f} Z{z:.9f} F{feed_mm_min:.2f}", self.state.position_mm
-        self._begin(_Pending(target_mm, is_path=False, points=0, touch_from_mm=here, line=line, from_mm=here))
-        self._control.mdi(line)
+        self._control.mdi(f"{_MODES} G61 G38.3 X{x:.9f} Y{y:.9f} Z{z:.9f} F{feed_mm_min:.2f}")
         return Result.OK
 
     def path_clear(self) -> Result:
@@ -270,7 +240,7 @@ class Motion:
 
     def _begin(self, pending: _Pending) -> None:
         self._control.complaints()
-        self.in_position_us, self.latch, self._resting_us = 0, None, None
+        self.in_position_us, self.latch = 0, None
         self._pending = pending
 
     def _refusal(self, feed_mm_min: float) -> Result:
