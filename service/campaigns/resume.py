@@ -173,7 +173,7 @@ class _Finder:
             return mounted_anew(item, number + 1)
         kept = len(item.resume_trail.carried)
         how = f"resumes after point {kept}, which is read again" if kept else "begins again"
-        if item.resume_trail.again is not None:
+        if item.resume_trail.again:
             how = f"resumes after {kept} features; the first one is touched again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"

@@ -8,30 +8,24 @@ from __future__ import annotations
 import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
-from datetime import datetime, timedelta
 
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.campaign_run import Resumed
 from abbe.service.campaigns.measure import MeasureOptions, artefacts_of, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates, check_devices, needed_by
-from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
-from abbe.service.errors import NotStored, PreconditionsChanged, TableMismatch, TableRefused
+from abbe.service.errors import TableMismatch, TableRefused
 from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, investigate, make_proposal, plan_for, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import RecipeSource
-from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.tables.nine_tables import read_base
 from abbe.service.verification.alarm_states import Alarm, Note
 
-Begins = Callable[[str, str], Awaitable[None]]
-"""``await begins(campaign, so_far)``: the campaign's name, and how much of it is complete (empty: nothing)."""
 SOLVING = "the measurement is complete, and nothing moves while it is solved"
 
 
@@ -75,80 +69,48 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
 
 
 async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note) -> None:
-    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as `investigate` and
-    `run_guided_campaign`.
-
-    A campaign that an earlier order began for this alarm goes on after its complete runs, if plan, machine and table are the same.
-    """
+    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both."""
 
     async def measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
         check_certificates(context.site)
         _check_not_ended(context)
-        stopped = alarm.last(AlarmKind.BEGUN)
-
-        async def begins(name: str, so_far: str) -> None:
-            await note(AlarmKind.BEGUN, AlarmFacts(text=f"measuring campaign {name!r}{so_far}", campaign=name))
-
         led = replace(context, plan=plan_for(context, alarm))
-        name, ids = await _measured(led, source, begins, "" if stopped is None else stopped.facts.campaign)
+        name = led.plan.name
+
+        async def begun() -> None:
+            await note(AlarmKind.BEGUN, AlarmFacts(text=f"measuring campaign {name!r}", campaign=name))
+
+        ids = await _measured(led, source, begun)
         return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {name!r} is measured: {len(ids)} runs", campaign=name))
 
     await investigate(context, alarm, note, measured)
 
 
-async def _measured(
-    context: InvestigationContext, source: RecipeSource, begins: Begins | None = None, stopped: str = ""
-) -> tuple[str, list[int]]:
-    """Measure the plan; return the name of its campaign and the numbers of its runs.
-
-    ``begins`` is called before anything moves, once the devices are checked. ``stopped``: a campaign to resume if possible.
-    """
-    site, store = context.site, context.store
+async def _measured(context: InvestigationContext, source: RecipeSource, begins: Callable[[], Awaitable[None]] | None = None) -> list[int]:
+    """Measure the plan; return the numbers of its runs. ``begins`` is called before anything moves, once the devices are checked."""
+    site, store, name = context.site, context.store, context.plan.name
     plan = paced(context.plan, site.max_feed_mm_min)
     prompted = _PromptedPerson(context.control)
+    options = MeasureOptions(control=context.control, source=source, part=True, live=context.live)
     with lock_machine(site.urls.cnc):
         async with recovered_session(store, site, ask=prompted.ask) as session:
             prompted.session = session
             await check_devices(session, plan, air=site.watching.air_c is not None)
             await context.control.gate()
             await _check_table_acts(session)
-            resumed = await _resumed(session, context, plan, stopped) if stopped else None
-            plan = plan if resumed is None else replace(plan, name=stopped)
             if begins is not None:
-                await begins(plan.name, "" if resumed is None else f": {len(resumed.done)} of {len(plan.tests)} tests are complete")
-            options = MeasureOptions(control=context.control, source=source, resumed=resumed, part=True, live=context.live)
-            begun = await start_campaign(session, store, site, plan.name, artefacts_of(plan)) if resumed is None else None
+                await begins()
+            begun = await start_campaign(session, store, site, name, artefacts_of(plan))
             try:
-                return plan.name, await measure(
+                return await measure(
                     session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
                 )
             except BaseException as error:
-                kept = f"completed runs of campaign {plan.name!r} are kept"
-                on = (
-                    f"`abbe measure -m MACHINE.toml --resume {plan.name!r}` resumes, then `abbe comp propose -m MACHINE.toml {plan.name!r}`"
-                )
-                error.add_note(f"{kept}; {on if begins is None else 'a search that is started again goes on after them'}")
+                kept = f"completed runs of campaign {name!r} are kept"
+                resume = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
+                anew = "" if begins is None else "; a search that is started again begins with the first set-up"
+                error.add_note(f"{kept}{anew}; {resume}")
                 raise
-
-
-async def _resumed(session: Session, context: InvestigationContext, plan: CampaignPlan, name: str) -> Resumed | None:
-    """Return where a campaign resumes; None: it cannot. Instruments left in the machine are mounted anew, since nobody has watched them."""
-
-    async def untouched(_: str) -> bool:
-        return False
-
-    try:
-        if not await asyncio.to_thread(_is_fresh, context, name):
-            return None
-        return await resume(session, context.store, context.site, plan, name, untouched)
-    except (NotStored, PreconditionsChanged):
-        return None
-
-
-def _is_fresh(context: InvestigationContext, name: str) -> bool:
-    """Return whether a campaign has at most half the age that the runs of a table may have: its rest takes time, too. Raises NotStored."""
-    age = context.clock.utc() - datetime.fromisoformat(context.store.campaigns.find(name).created_utc)
-    return age < timedelta(hours=context.site.limits.age_h / 2.0)
 
 
 async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:

@@ -7,9 +7,13 @@ from datetime import UTC, datetime, tzinfo
 
 _UNITS = {"um": "µm", "urad": "µrad", "mm": "mm", "ppm": "ppm", "s": "s", "c": "°C", "percent": "%"}
 
-_COMMAND = re.compile(r"\babbe [a-z]{3}")
-_ASIDE = re.compile(r" ?[(（][^()（）]*\babbe [a-z]{3}[^()（）]*[)）]")
-_PARTS = re.compile(r"((?<=[;:.]) |(?<=。))")
+_NAME = r"\babbe (?!command)[a-z]{3}"
+_COMMAND = re.compile(_NAME)
+_SPAN = re.compile(r"`?" + _NAME + r"[^`;,。]*`?")
+_ASIDE = re.compile(r" ?[(（][^()（）]*" + _NAME + r"[^()（）]*[)）]")
+_PARTS = re.compile(r"((?<=[;.]) |(?<=。))")
+_MOST_WORDS = 4
+"""A part of a text with more words beside its command says something else, too, and stays."""
 
 
 def stamp(time: datetime, zone: tzinfo = UTC) -> str:
@@ -35,9 +39,19 @@ def number(value: float | None) -> str:
 
 
 def without_commands(text: str) -> str:
-    """Return a text without the parts that name a command: a person at the page has no command line."""
+    """Return a text without the brackets and parts that only name a command of the command line: a person at the page has none.
+
+    A part that says more stays whole: it may hold a cause, or what to do first.
+    """
     if not _COMMAND.search(text):
         return text
     parts = _PARTS.split(_ASIDE.sub("", text))
-    kept = [part + end for part, end in zip(parts[::2], [*parts[1::2], ""], strict=True) if not _COMMAND.search(part)]
+    kept = [part + end for part, end in zip(parts[::2], [*parts[1::2], ""], strict=True) if not _only_names_command(part)]
     return "".join(kept).rstrip(" ;:")
+
+
+def _only_names_command(part: str) -> bool:
+    if not _COMMAND.search(part):
+        return False
+    beside = re.findall(r"\w+", _SPAN.sub(" ", part))
+    return sum(1 if word.isascii() else max(1, len(word) // 3) for word in beside) <= _MOST_WORDS

@@ -78,8 +78,8 @@ async def test_the_qualified_radius_is_that_of_the_ball_less_its_pretravel_and_t
     radius, u = (found.setup.document[key] for key in ("tool_radius_mm", "u_tool_radius_mm"))
     stylus = b.sim.world.table.stylus
     around = stylus.radius_mm - stylus.pretravel_mm  # the top is reached with less pre-travel, and weighs little
-    assert radius == pytest.approx(around, abs=0.0025)
-    assert 0.0002 <= u < 0.0005, "that of the sphere, and a little"
+    assert abs(radius - around) < 2.0 * u
+    assert 0.001 <= u < 0.0015, "lobing, the sphere, and a little"
     alone = load_run(store, store.runs.all()[0].id)
     assert alone.setup.document["tool_radius_mm"] == radius
 

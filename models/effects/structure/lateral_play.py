@@ -32,7 +32,7 @@ def _along_guide(path: Path, at: Places, key: str, values: Values) -> F3:
 
 
 def _at_rest(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return the shift in runs that do not move the axis: the direction of its last motion, before the run, is unknown."""
+    """Return the shift in runs that do not move the axis. Its last motion is unknown, and counts as the same before all these runs."""
     rests = at is path.at and not at.sign[:, axis_of(key)].any()
     return along(direction_of(key), np.full(len(at.t_s), 0.5 * UM * rests))
 

@@ -118,6 +118,15 @@ class ArtefactTest(TestRecipe):
         parts = probe_parts(self.stylus_radius_mm, self.shaft_radius_mm, self.stylus_length_mm, self.body_radius_mm)
         solids = (balls, Boxes.of(plate.obstacles, self.origin_mm, self.matrix()))
         check_clear(self.artefact, order, start_mm, parts, solids, self.search_mm)
+        again = order[: 1 if self.sphere is None else 2]
+        for one in dict.fromkeys(order):  # after a pause at any feature the first ones are touched again
+            check_clear(self.artefact, (*again, one), one.above_mm, parts, solids, self.search_mm)
+        if self.shaft_radius_mm is not None and self.shaft_radius_mm > self.stylus_radius_mm:
+            raise ConfigError(
+                f"artefact {self.artefact}: the shaft of the stylus (radius {self.shaft_radius_mm:g} mm) is thicker than its ball "
+                f"({self.stylus_radius_mm:g} mm), so the shaft touches first",
+                "correct shaft_radius_mm or stylus_radius_mm",
+            )
         deepest = self.depth_mm + self.search_mm
         if len(there) < len({one.feature for one in order}) and self.stylus_length_mm is not None and self.stylus_length_mm < deepest:
             raise ConfigError(

@@ -25,26 +25,12 @@ ROUNDS = 28
 
 @dataclass(frozen=True, slots=True)
 class ProbePart:
-    """A cylinder about the stylus, from ``from_mm`` to ``to_mm`` above the centre of its ball (away from the artefact); or that ball.
-    122: Return the least distance of each body from lines that begin above these places, (bodies,), by thirds: it is convex on a line."""
+    """A cylinder with round ends about the stylus, or its ball; the axis runs from ``from_mm`` to ``to_mm`` above the ball's centre."""
 
     name: str
     radius_mm: float
     from_mm: float
     to_mm: float
-
-    def lines(self, up: Array) -> tuple[float, Array]:
-        """Return thin rods that fill the cylinder: their radius, and the places of their axes beside the stylus, (n, 3).
-
-        A thick cylinder is flat below; one thick rod would be round there.
-        """
-        if self.from_mm == 0.0:
-            return self.radius_mm, np.zeros((1, 3))
-        first = np.eye(3)[int(np.argmin(np.abs(up)))]
-        first = np.cross(up, first) / np.linalg.norm(np.cross(up, first))
-        at = [(0.32, 2.0 * np.pi * k / 5) for k in range(5)] + [(0.75, 2.0 * np.pi * k / 11) for k in range(11)]
-        beside = [share * (np.cos(a) * first + np.sin(a) * np.cross(up, first)) for share, a in at]
-        return 0.25 * self.radius_mm, self.radius_mm * np.array([np.zeros(3), *beside])
 
 
 def probe_parts(ball_mm: float, shaft_mm: float | None, length_mm: float | None, body_mm: float) -> tuple[ProbePart, ...]:
@@ -110,13 +96,8 @@ class Boxes:
         return cls(tuple(one.id for one in known), low, high, np.array(origin_mm), matrix)
 
     def gaps_mm(self, places_mm: Array, up: Array, part: ProbePart) -> Array:
-        """As `Solids`."""
-        whole = self._rod(places_mm, up, part.from_mm, part.to_mm) - part.radius_mm
-        if part.from_mm == 0.0 or not (whole <= 0.0).any():
-            return whole
-        radius, lines = part.lines(up)
-        begin = part.from_mm + 0.7 * radius  # a rod is round below
-        return np.asarray(np.min([self._rod(places_mm + line, up, begin, part.to_mm) for line in lines], axis=0) - radius)
+        """Return the gaps as `Solids` does; the part counts as round at both ends, so a flat end may seem nearer than it is."""
+        return self._rod(places_mm, up, part.from_mm, part.to_mm) - part.radius_mm
 
     def _rod(self, places_mm: Array, up: Array, from_mm: float, to_mm: float) -> Array:
         """Return the least distance of each body from lines that begin above these places, (bodies,), by thirds: it is convex along a
@@ -159,7 +140,7 @@ def check_clear(
         for part in parts:
             for some in solids:
                 gaps = some.gaps_mm(places, up, part)
-                meant = np.array([part.from_mm == 0.0 and name == one.feature for name in some.names], dtype=bool)
+                meant = np.array([isinstance(some, Balls) and part.from_mm == 0.0 and n == one.feature for n in some.names], dtype=bool)
                 gaps = np.where(meant, np.inf, gaps)
                 if gaps.size and gaps.min() < margin_mm:
                     raise ConfigError(

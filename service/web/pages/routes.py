@@ -231,7 +231,8 @@ async def _decided(context: PageContext, work: Callable[[], object]) -> Response
     try:
         await context.read(work)
     except TableRefused as error:
-        return problem(409, phrase(current().lang, error.detail), error.code)
+        told = [phrase(current().lang, text) for text in (error.detail, error.remedy) if text]
+        return problem(409, " - ".join(told), error.code)
     except NotStored as error:
         return problem(404, error.detail, error.code)
     return None

@@ -24,7 +24,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
-from abbe.service.errors import Aborted, NotObservable, PreconditionsChanged, Stopped, TableMismatch, TableRefused
+from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
 from abbe.service.jobs import investigate
 from abbe.service.jobs.investigate import InvestigationContext
@@ -198,12 +198,16 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         assert isinstance(asking.exception(), Stopped) == (number == 2)
 
 
-def without_devices(monkeypatch: pytest.MonkeyPatch, measure: Any) -> Any:
-    """Replace the devices and the measurement of a campaign; return its pretended context."""
-
+@pytest.mark.parametrize("searching", [False, True])
+async def test_what_is_broken_off_tells_how_it_is_gone_on_with_and_that_a_new_search_is_not(
+    searching: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     @asynccontextmanager
     async def session(*_: object, **__: object) -> AsyncIterator[Any]:
         yield SimpleNamespace(controller=None)
+
+    async def stopped(*_: object, **__: object) -> Any:
+        raise Stopped("by a person", "")
 
     for name, instead in (
         ("lock_machine", lambda _: nullcontext()),
@@ -212,55 +216,17 @@ def without_devices(monkeypatch: pytest.MonkeyPatch, measure: Any) -> Any:
         ("check_devices", all_there),
         ("_check_table_acts", all_there),
         ("start_campaign", all_there),
-        ("measure", measure),
+        ("measure", stopped),
     ):
         monkeypatch.setattr(work, name, instead)
     bench = pretended(max_feed_mm_min=6000.0, urls=SimpleNamespace(cnc="cnc"))
     bench.live = None
     bench.control.now(State.RUNNING)
-    return bench
-
-
-@pytest.mark.parametrize("searching", [False, True])
-async def test_what_is_broken_off_tells_how_it_is_gone_on_with(searching: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def stopped(*_: object, **__: object) -> Any:
-        raise Stopped("by a person", "")
-
-    bench = without_devices(monkeypatch, stopped)
     with pytest.raises(Stopped) as told:
         await work._measured(bench, {}, all_there if searching else None)  # type: ignore[arg-type]
     (note,) = told.value.__notes__
-    assert ("abbe measure -m MACHINE.toml --resume 'full 1'" in note) == (not searching)
-    assert ("a search that is started again goes on after them" in note) == searching
-
-
-@pytest.mark.parametrize("goes_on", [True, False])
-async def test_a_search_goes_on_with_the_campaign_in_which_it_was_stopped(goes_on: bool, monkeypatch: pytest.MonkeyPatch) -> None:
-    asked: list[bool] = []
-    begun: list[tuple[str, str]] = []
-
-    async def found(session: Any, store: Any, site: Any, plan: Any, name: str, confirm: Any) -> Any:
-        asked.append(await confirm("Is it still untouched?"))
-        if not goes_on:
-            raise PreconditionsChanged("the controller was restarted")
-        return SimpleNamespace(done={"a": 4})
-
-    async def measured(*_: object, campaign: Any, options: Any, **__: object) -> list[int]:
-        assert (options.resumed is not None, campaign) == (goes_on, None), "a campaign that goes on is not started"
-        return [4, 5]
-
-    async def begins(name: str, so_far: str) -> None:
-        begun.append((name, so_far))
-
-    bench = without_devices(monkeypatch, measured)
-    monkeypatch.setattr(work, "_is_fresh", lambda *_: True)
-    monkeypatch.setattr(work, "resume", found)
-    line = Linear("l", "L1", "identify", 0, positions=5, at_share=(0.15, 0.15)).plan(MACHINE)
-    bench.plan = CampaignPlan("full 2", (line, line))
-    name, ids = await work._measured(bench, {}, begins, "full 1")  # type: ignore[arg-type]
-    assert (name, ids) == ("full 1" if goes_on else "full 2", [4, 5])
-    assert begun == [(name, ": 1 of 2 tests are complete" if goes_on else "")]
-    assert asked == [False], "nobody has watched what was left mounted: it is mounted anew"
+    assert "abbe measure -m MACHINE.toml --resume 'full 1'" in note
+    assert ("begins with the first set-up" in note) == searching
 
 
 class Lines:
@@ -280,12 +246,11 @@ async def test_the_cause_of_an_alarm_is_measured_with_a_person_and_its_lines_com
     await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
     alarm = await lines.note(AlarmKind.ORDERED, AlarmFacts(name="petra"))
 
-    async def led(context: Any, source: Any, begins: Any, stopped: str) -> tuple[str, list[int]]:
+    async def led(context: Any, source: Any, begins: Any) -> list[int]:
         assert [line.kind for line in lines.lines] == ["raised", "ordered"], "nothing has begun before the devices are checked"
-        assert stopped == ""
-        await begins(context.plan.name, "")
+        await begins()
         assert (lines.lines[-1].kind, context.plan.name) == ("begun", lines.lines[-1].facts.campaign)
-        return context.plan.name, [7, 8]
+        return [7, 8]
 
     async def nothing_found(context: Any, alarm: Alarm, note: Any) -> Alarm:
         raise NotObservable("scale of X")

@@ -26,7 +26,7 @@ def texts(page: str) -> list[str]:
 
 
 def test_every_screen_is_in_its_language(tmp_path_factory: pytest.TempPathFactory) -> None:
-    """In a world of its own: other tests write remarks into the common one. None tells a person to type a command."""
+    """In a world of its own: other tests write remarks into the common one. None has a part that only names a command."""
     left: dict[str, str] = {}
     with served(filled_once(tmp_path_factory)) as running:
         read = {}
