@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from contextvars import ContextVar
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
+
+if TYPE_CHECKING:
+    import asyncio
 
 NO_RUN = "no run"
 _RUN: ContextVar[str] = ContextVar("run", default=NO_RUN)
@@ -134,6 +136,8 @@ async def run_to_end(work: Coroutine[Any, Any, T]) -> T:
     asyncio.CancelledError
         Raised after the end of the work if the caller was cancelled meanwhile: a cancellation is delayed, never swallowed.
     """
+    import asyncio  # with sockets and TLS; a command that only reads knows these errors, too
+
     task = asyncio.ensure_future(work)
     interrupted: asyncio.CancelledError | None = None
     while not task.done():

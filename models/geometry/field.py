@@ -103,18 +103,19 @@ def grid_lines(axes_mm: F2) -> Lines | None:
         return None
     grid = np.asarray(axes_mm).reshape(-1, ny, nz, 3)
     lines = grid[:, 0, 0, 0].copy(), grid[0, :, 0, 1].copy(), grid[0, 0, :, 2].copy()
+    stretch = -(-len(grid) // (4 * CORES))
     differing: list[int] = []
 
-    def planes(rows: slice) -> None:
-        plane = np.empty(grid.shape[1:])
+    def planes(stretches: slice) -> None:
+        plane = np.empty(grid.shape[1:])  # once for many planes: to fill it costs more than to compare
         plane[..., 1], plane[..., 2] = lines[1][:, None], lines[2]
-        for k in range(rows.start, rows.stop):
+        for k in range(stretches.start * stretch, min(stretches.stop * stretch, len(grid))):
             plane[..., 0] = lines[0][k]
-            if differing or not np.array_equal(grid[k], plane):
+            if differing or not (grid[k] == plane).all():
                 differing.append(k)
                 return
 
-    in_blocks(len(grid), planes, weight=ny * nz)
+    in_blocks(-(-len(grid) // stretch), planes, weight=stretch * ny * nz)
     return None if differing else lines
 
 

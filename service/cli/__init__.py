@@ -34,12 +34,20 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # none is used, and to look for some reads the description of every package
-    gc.set_threshold(50_000)  # what imports make stays: searching it for garbage would be a sixth of the start
+    gc.set_threshold(200_000)  # what imports make stays: searching it for garbage would be a sixth of a short command
+    gc.callbacks.append(_begun)
     try:
         code = run(arguments)
     except KeyboardInterrupt:
         code = INTERRUPTED
+    gc.freeze()  # nor does the end of the interpreter search it
     sys.exit(code)
+
+
+def _begun(_phase: str, _info: dict[str, int]) -> None:
+    """Collect garbage as `abbe.service.children` does from the first collection on: then a command works, and no longer imports."""
+    gc.callbacks.remove(_begun)
+    gc.set_threshold(50_000)
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

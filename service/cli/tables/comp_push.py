@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -152,6 +151,8 @@ def accept_table(
             return await accept(session.controller, store, site, by_whom())
 
     with Store.open(loaded.database_url) as store:
+        import asyncio
+
         text = asyncio.run(work(store))
     answer({"text": text}, text, as_json=as_json)
     conclude(measure_now(loaded.path), as_json=as_json)

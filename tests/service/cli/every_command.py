@@ -5,8 +5,23 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
 
+from abbe.service.domain.document import document
+from abbe.service.effects.model_book import NewVersion, current
+from abbe.service.storage.store import Store
+from tests.pages_world import filled_once
+from tests.service.conftest import ERRORS, write_json
+
+DEVICES = """[devices]
+cnc = "modbus+tcp://127.0.0.1:9"
+laser = "modbus+tcp://127.0.0.1:9"
+ballbar = "socket://127.0.0.1:9"
+fixture = "fixture+tcp://127.0.0.1:9"
+"""
+"""Nobody answers there."""
 INIT = ("--name", "m", "--chain", "w-X-Y-b-Z-t", "--strokes", "0..600,0..500,0..400", "--tool", "0,0,-1")
 
 
@@ -116,3 +131,20 @@ def table() -> str:
         proof = case.proof or "tests/service/cli/test_every_command.py"
         rows.append(f"| {name} | yes | {codes} | yes | `abbe {case.then} ...` | `abbe {case.wrong}`: {case.error} | `{proof}` |\n")
     return head + "".join(rows)
+
+
+def filled_folder(factory) -> Path:
+    """A folder with a filled database, its machine file, and a file for each command that reads one."""
+    filled = filled_once(factory)
+    folder = Path(filled.url.removeprefix("sqlite:///")).parent
+    with Store.open(filled.url) as store:
+        doc = store.machines.get(store.campaigns.find(filled.campaign).machine_id).doc
+        first = current(store, "VMC-1")
+        assert first is not None
+        store.models.add(NewVersion("VMC-1", 1, document(replace(first.book, parent=1, why="the axis was repaired"))))
+    lines = [f'name = "{filled.machine}"', f'chain = "{doc["chain"]}"', f"tool_mm = {doc['tool_mm']}", "[stroke_mm]"]
+    (folder / "abbe.toml").write_text("\n".join([*lines, *(f"{axis} = {at}" for axis, at in doc["stroke_mm"].items()), DEVICES]))
+    (folder / "words.json").write_text(json.dumps({"SOLUTION": filled.solution, "PROPOSAL": filled.proposals[-1]}))
+    write_json(folder / "errors.json", ERRORS)
+    (folder / "p.csv").write_text("x_mm,y_mm,z_mm\n100,200,50\n")
+    return folder

@@ -10,7 +10,6 @@ import json
 import os
 import re
 import shlex
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -20,21 +19,9 @@ import typer
 from abbe.service.cli import run
 from abbe.service.cli.administration.audit import commands
 from abbe.service.cli.app import app
-from abbe.service.domain.document import document
-from abbe.service.effects.model_book import NewVersion, current
-from abbe.service.storage.store import Store
 from tests.conftest import ROOT as REPOSITORY
-from tests.pages_world import filled_once
-from tests.service.cli.every_command import CASES, Case
-from tests.service.conftest import ERRORS, write_json
+from tests.service.cli.every_command import CASES, Case, filled_folder
 
-DEVICES = """[devices]
-cnc = "modbus+tcp://127.0.0.1:9"
-laser = "modbus+tcp://127.0.0.1:9"
-ballbar = "socket://127.0.0.1:9"
-fixture = "fixture+tcp://127.0.0.1:9"
-"""
-"""Nobody answers there."""
 pytestmark = pytest.mark.timeout(300)
 ROOT: Any = typer.main.get_command(app)
 HERE = [name for name, case in CASES.items() if not case.proof]
@@ -42,20 +29,7 @@ HERE = [name for name, case in CASES.items() if not case.proof]
 
 @pytest.fixture(scope="module")
 def world(tmp_path_factory) -> Path:
-    """A folder with a filled database, its machine file, and a file for each command that reads one."""
-    filled = filled_once(tmp_path_factory)
-    folder = Path(filled.url.removeprefix("sqlite:///")).parent
-    with Store.open(filled.url) as store:
-        doc = store.machines.get(store.campaigns.find(filled.campaign).machine_id).doc
-        first = current(store, "VMC-1")
-        assert first is not None
-        store.models.add(NewVersion("VMC-1", 1, document(replace(first.book, parent=1, why="the axis was repaired"))))
-    lines = [f'name = "{filled.machine}"', f'chain = "{doc["chain"]}"', f"tool_mm = {doc['tool_mm']}", "[stroke_mm]"]
-    (folder / "abbe.toml").write_text("\n".join([*lines, *(f"{axis} = {at}" for axis, at in doc["stroke_mm"].items()), DEVICES]))
-    (folder / "words.json").write_text(json.dumps({"SOLUTION": filled.solution, "PROPOSAL": filled.proposals[-1]}))
-    write_json(folder / "errors.json", ERRORS)
-    (folder / "p.csv").write_text("x_mm,y_mm,z_mm\n100,200,50\n")
-    return folder
+    return filled_folder(tmp_path_factory)
 
 
 class Call:
