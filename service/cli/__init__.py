@@ -34,13 +34,15 @@ def main(arguments: Sequence[str] | None = None) -> None:
     # For matrices of a few hundred unknowns BLAS threads cost more than they save: minutes if other programs compute too.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     os.environ.setdefault("PYDANTIC_DISABLE_PLUGINS", "1")  # none is used, and to look for some reads the description of every package
-    gc.set_threshold(200_000)  # what imports make stays: searching it for garbage would be a sixth of a short command
-    gc.callbacks.append(_begun)
+    if arguments is None:
+        gc.set_threshold(200_000)  # what imports make stays: searching it for garbage would be a sixth of a short command
+        gc.callbacks.append(_begun)
     try:
         code = run(arguments)
     except KeyboardInterrupt:
         code = INTERRUPTED
-    gc.freeze()  # nor does the end of the interpreter search it
+    if arguments is None:
+        gc.freeze()  # nor does the end of the interpreter search it
     sys.exit(code)
 
 

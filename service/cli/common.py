@@ -277,18 +277,27 @@ def give_form(app: typer.Typer) -> None:
 
 def _with_out(work: Any) -> Any:
     """Return a command with the option ``--out FILE``, unless it has its own. A command that fails leaves the file as it was."""
-    signature = inspect.signature(work, eval_str=True)
-    if "out" in signature.parameters or "context" in signature.parameters:
-        return work
+    code = inspect.unwrap(work).__code__
+    own = code.co_varnames[: code.co_argcount + code.co_kwonlyargcount]
+    return work if "out" in own or "context" in own else _WithOut(work)
 
-    @functools.wraps(work)
-    def around(out: Path | None = None, **given: Any) -> Any:
+
+class _WithOut:
+    """A command with ``--out FILE``. Its signature is computed when it is asked for: that of sixty others would be a tenth of the help."""
+
+    def __init__(self, work: Any) -> None:
+        functools.update_wrapper(self, work)
+        self._work = work
+
+    def __call__(self, out: Path | None = None, **given: Any) -> Any:
         with answer_into(out):
-            return work(**given)
+            return self._work(**given)
 
-    added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=OutOption)
-    around.__signature__ = signature.replace(parameters=[*signature.parameters.values(), added])  # type: ignore[attr-defined]
-    return around
+    @property
+    def __signature__(self) -> inspect.Signature:
+        signature = inspect.signature(self._work, eval_str=True)
+        added = inspect.Parameter("out", inspect.Parameter.KEYWORD_ONLY, default=None, annotation=OutOption)
+        return signature.replace(parameters=[*signature.parameters.values(), added])
 
 
 @contextmanager

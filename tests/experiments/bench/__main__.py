@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from abbe.models.geometry.chain import deviation_mm, exact_deviation_mm
-from tests.experiments.bench import capture, discovery, discovery_case, history, parsers, reanalysis, report
+from tests.experiments.bench import capture, discovery, discovery_case, history, parsers, reanalysis, report, start
 from tests.experiments.bench.case import CASES, make
 from tests.experiments.bench.contestants import EXTRA, FLOORS, OURS, PEERS, contestants
 from tests.experiments.bench.facts import facts
@@ -26,7 +26,7 @@ from tests.experiments.bench.worker import NO_RESULT
 
 SLOW_S = 0.5
 """A contestant of the map whose call takes longer is run in the first round only."""
-PARTS = ("map", "trials", "discovery", "capture", "parsers", "history", "reanalysis")
+PARTS = ("map", "trials", "discovery", "capture", "parsers", "history", "reanalysis", "start")
 ROUNDING_MM = 1e-12
 SECOND_ORDER_MM = 1e-5
 """What exact kinematics may add to rule G on this machine: measured 1.6e-6. Leaving out any one of the 18 tables changes 5.6e-4 or more
@@ -44,7 +44,7 @@ def main() -> int:
     parser.add_argument(
         "--only",
         choices=PARTS,
-        help="error map; trials, propagation, joint solution; naming of effects; samples into the database; a month of checks; solving",
+        help="error map; trials and joint solution; naming of effects; samples into the database; a month of checks; solving; start",
     )
     parser.add_argument("--cases", type=int, default=discovery_case.CASES, help=f"campaigns to name (default {discovery_case.CASES})")
     given = parser.parse_args()
@@ -60,6 +60,7 @@ def main() -> int:
             "parsers": lambda: parsers.compared(given.rounds, _progress),
             "history": lambda: history.compared(_progress),
             "reanalysis": lambda: reanalysis.compared(_progress),
+            "start": lambda: start.compared(_progress),
         }
         for part in parts:
             key = "cases" if part == "map" else part
@@ -68,7 +69,7 @@ def main() -> int:
     if given.json:
         given.json.write_text(json.dumps(found, indent=1) + "\n", encoding="utf-8")
     whole = [*found["cases"].values(), *found["trials"].values()]
-    right = all(one["right"] for part in ("capture", "parsers", "history", "reanalysis") for one in found[part].values())
+    right = all(one["right"] for part in ("capture", "parsers", "history", "reanalysis", "start") for one in found[part].values())
     return 0 if right and all(a["ok"] for case in whole for a in case["agreement"].values()) else 1
 
 

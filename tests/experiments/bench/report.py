@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from tests.experiments.bench import capture, discovery_report, history, parsers, reanalysis, trials_report
+from tests.experiments.bench import capture, discovery_report, history, parsers, reanalysis, start, trials_report
 from tests.experiments.bench.contestants import EXTRA, FLOORS, OURS, PEERS
 from tests.experiments.bench.facts import LIBRARIES
 
@@ -59,6 +59,8 @@ def text(found: dict) -> str:
         lines += history.lines(found["history"])
     if found["reanalysis"]:
         lines += reanalysis.lines(found["reanalysis"])
+    if found["start"]:
+        lines += start.lines(found["start"])
     return "\n".join([*lines, "", "Times never fail this run, differing results do."])
 
 

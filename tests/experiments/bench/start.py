@@ -6,6 +6,8 @@ programs do to the caches is not the command's. `tests/project/test_project.py` 
 
 from __future__ import annotations
 
+import importlib.util
+import json
 import os
 import resource
 import shlex
@@ -19,7 +21,9 @@ from tests.service.cli.every_command import CASES, filled_folder
 
 CALLS = 5
 GOAL_S = 0.4
-COMPUTES = frozenset(("plan", "measure", "solve", "solve-all", "discover", "simulate", "errors", "report", "comp export", "comp step", "papers"))
+COMPUTES = frozenset(
+    ("plan", "measure", "solve", "solve-all", "discover", "simulate", "errors", "report", "comp export", "comp step", "papers")
+)
 """Commands whose answer is computed: they are measured on the refused input only."""
 SLOW = frozenset(("user add", "user password", "user token new"))
 """A password's hash is slow on purpose."""
@@ -41,7 +45,12 @@ class Folders:
 
 
 def compared(progress: Callable[[str], None]) -> dict:
-    """Seconds of processor time by command: ``refused`` and ``answer``. ``right``: exit codes are those promised."""
+    """Seconds of processor time by command: ``refused`` and ``answer``. ``right``: exit codes are those promised.
+
+    Nothing without the developers' environment, whose libraries fill the folder.
+    """
+    if importlib.util.find_spec("httpx") is None:
+        return {}
     with tempfile.TemporaryDirectory() as name:
         progress("start: filling a folder")
         folder = filled_folder(Folders(Path(name)))
@@ -60,8 +69,6 @@ def compared(progress: Callable[[str], None]) -> dict:
 
 def _best(words: str, folder: Path, typed: str = "") -> tuple[float, int]:
     """Least processor time of several calls, and the exit code of the first; ``#`` is the number of the call."""
-    import json
-
     names = json.loads((folder / "words.json").read_text())
     for name, value in names.items():
         words = words.replace(name, str(value))

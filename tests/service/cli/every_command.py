@@ -9,12 +9,6 @@ import json
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from abbe.service.domain.document import document
-from abbe.service.effects.model_book import NewVersion, current
-from abbe.service.storage.store import Store
-from tests.pages_world import filled_once
-from tests.service.conftest import ERRORS, write_json
-
 DEVICES = """[devices]
 cnc = "modbus+tcp://127.0.0.1:9"
 laser = "modbus+tcp://127.0.0.1:9"
@@ -135,6 +129,12 @@ def table() -> str:
 
 def filled_folder(factory) -> Path:
     """A folder with a filled database, its machine file, and a file for each command that reads one."""
+    from abbe.service.domain.document import document
+    from abbe.service.effects.model_book import NewVersion, current
+    from abbe.service.storage.store import Store
+    from tests.pages_world import filled_once
+    from tests.service.conftest import ERRORS, write_json
+
     filled = filled_once(factory)
     folder = Path(filled.url.removeprefix("sqlite:///")).parent
     with Store.open(filled.url) as store:
