@@ -27,8 +27,13 @@ from hypothesis import HealthCheck, settings
 from tests.built_once import _commands_built_once, _schema_built_once  # noqa: F401 - fixtures of every test
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
-settings.register_profile(  # how fast examples are drawn says something of the computer, nothing of the product
-    "fixed", derandomize=True, database=None, max_examples=100 if LONG else 40, suppress_health_check=[HealthCheck.too_slow]
+settings.register_profile(  # how fast an example is drawn or passes says something of the computer, nothing of the product
+    "fixed",
+    derandomize=True,
+    database=None,
+    max_examples=100 if LONG else 40,
+    deadline=None,
+    suppress_health_check=[HealthCheck.too_slow],
 )
 settings.load_profile("fixed")  # a test that fails must fail again: hypothesis draws the same examples in every run
 
