@@ -75,10 +75,11 @@ def same_pose(a: RunData, b: RunData) -> bool:
 
 
 def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = False) -> VerificationFigure:
-    """Return the rms deviation of the machine over an artefact, whose form a solution knows, after a fit of the pose.
+    """Return the rms deviation of the machine over an artefact whose form is known from a solution, after a fit of the pose.
 
-    ``with_machine``: the residual of the machine's solution in place of the whole deviation. Without a calibrated length the common
-    scale is fitted, too. Noise and uncertainty of the form enlarge the rms; both are subtracted in squares, and give its uncertainty.
+    ``with_machine``: what the machine's solution leaves of the deviation, instead of the whole deviation. Without a calibrated length the
+    common scale is fitted, too. Noise and the uncertainty of the form enlarge the rms: their expected share is subtracted from its square.
+    The uncertainty of the result follows from the same two.
     """
     p = run.points
     assert p is not None

@@ -351,7 +351,10 @@ def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[froze
 
 
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
-    """Return for each effect, by index, the rms of the holdout runs without it divided by that with all effects (`NamedEffect.needed`)."""
+    """Return a ratio for each effect, by index: rms residual of the holdout runs without the effect, over the rms with all effects.
+
+    None without holdout runs (`NamedEffect.needed`).
+    """
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:

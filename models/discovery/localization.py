@@ -1,10 +1,10 @@
 """Localization of the gap between measurement and simulation (`locate`), and of an effect's signal (`localize_signal`).
 
-The gap is located by tests of the whitened residuals by run, axis, direction, feed, time, position, frequency and temperature. A signal is
-located at the tests, runs, axes, directions, time and position that hold most of its energy.
+The gap is located by statistical tests of the whitened residuals, grouped by run, axis, direction, feed, time, position, frequency and
+temperature. A signal is located by the kinds of measurement, runs, axes, directions, time and position that hold most of its energy.
 
-Every p-value is family-wise (Sidak over all tests). Energy is tested reading by reading and in block sums, which are sensitive to smooth
-deviations; the noise variance is enlarged by `ROOM`.
+Every p-value is family-wise (Sidak over all statistical tests). Energy is tested reading by reading and in block sums, which are sensitive
+to smooth deviations; the noise variance is enlarged by `ROOM`.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Forward selection of missing effects with backward steps and a price for every parameter and label tried.
 
 A label is an effect with its key (axis or error motion); a label of the catalogue is called a name. Before a candidate is compared, its
-non-linear parameters are refined (`refined`): from its best start to the neighbouring starts, or close to its start if it is a structure
-without a name. Other names are tried in place of a chosen one on the same readings (`rivals_of`).
+non-linear parameters are refined from its best start (`refined`): between the neighbouring starts, or, for a structure without a name, only
+close to the start. Other names are tried in place of a chosen one on the same readings (`rivals_of`).
 """
 
 from __future__ import annotations

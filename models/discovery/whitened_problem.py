@@ -119,7 +119,7 @@ class SignalProjection:
 
 
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:
-    """Return the rows of `SignalProjection.rows` for ``columns``; ``left``: the part of the columns that the projection leaves."""
+    """Return what `SignalProjection.rows` returns for ``columns``; ``left``: what remains of them after the projection."""
     gram = columns.T @ left + np.diag(prior_sd**-2.0)
     return np.asarray(scipy.linalg.solve_triangular(scipy.linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))
 

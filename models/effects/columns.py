@@ -78,7 +78,7 @@ def of_machine(deviation: Deviation) -> Signal:
 
 
 def of_places(deviation: Deviation) -> Signal:
-    """Do the same as `of_machine`, but for all runs at once: the deviation treats each row of `Places` alone and uses no temperature."""
+    """Do the same as `of_machine` for all runs at once, if the deviation treats each row of `Places` alone and uses no temperature."""
     return lambda paths, key, values: read_together(paths, lambda at: deviation(at, key, values))
 
 

@@ -44,7 +44,7 @@ class MonteCarlo:
     settled : array of bool, shape (m,)
         Whether mean, u and the ends of both intervals are known to this tolerance, at 95 %.
     ends_known : array, shape (m,)
-        Half-width at 95 % of the ends of the symmetric interval; inf from fewer than `FEWEST_BATCHES` batches.
+        Numerical uncertainty (95 %) of the less certain end of the symmetric interval; inf with fewer than `FEWEST_BATCHES` batches.
     """
 
     mean: F1

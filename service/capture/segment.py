@@ -35,7 +35,7 @@ class FileIO(Protocol):
         ...
 
     def sync(self, handle: int) -> None:
-        """Return when everything written is on the disk."""
+        """Wait until everything written is on the disk."""
         ...
 
     def truncate(self, handle: int, size: int) -> None:
@@ -47,7 +47,7 @@ class FileIO(Protocol):
         ...
 
     def sync_folder(self, folder: Path) -> None:
-        """Return when the folder's entries are on the disk."""
+        """Wait until the folder's entries are on the disk."""
         ...
 
     def reserve_space(self, path: Path, size: int) -> None:
@@ -79,7 +79,7 @@ class RealFileIO:
             rest = rest[os.write(handle, rest) :]
 
     def sync(self, handle: int) -> None:
-        """Return when everything written is on the disk."""
+        """Wait until everything written is on the disk."""
         os.fdatasync(handle)
 
     def truncate(self, handle: int, size: int) -> None:
@@ -91,7 +91,7 @@ class RealFileIO:
         os.close(handle)
 
     def sync_folder(self, folder: Path) -> None:
-        """Return when the folder's entries are on the disk."""
+        """Wait until the folder's entries are on the disk."""
         descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_CLOEXEC)
         try:
             os.fsync(descriptor)

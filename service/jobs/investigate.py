@@ -144,10 +144,11 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
 
 
 def _objections(finding: Finding, store: Store, machine: str) -> AlarmFacts:
-    """Return the reasons against tables: ``against`` (text; empty: none), ``rms_um`` (unexplained readings beyond noise), ``unnamed``.
+    """Return the objections to tables.
 
-    An effect that no table corrects is an objection unless the machine's model contains it: effects of the model are subtracted from the
-    readings before tables are made. ``unnamed``: something is missing, and no effect was found for it.
+    ``against``: the objections as text, empty without any. ``rms_um``: rms of what the model leaves of the readings beyond noise.
+    ``unnamed``: whether something is missing and no effect was found for it. An effect that no table corrects is an objection unless the
+    machine's model contains it: effects of the model are subtracted from the readings before tables are made.
     """
     gap = finding.gaps.get("identify")
     rms_um = 0.0 if gap is None else math.sqrt(max(gap.before_um**2 - gap.floor_um**2, 0.0))

@@ -232,8 +232,7 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
     Raises
     ------
     StatusUnknown
-        No reply within ``unknown_s``. After a stall of this computer in that time, even one that is over, the controller gets ``unknown_s``
-        once more.
+        No reply within ``unknown_s``. If this computer itself stalled in that time, the wait is extended once by another ``unknown_s``.
     Rebooted
         The controller restarted.
     """

@@ -96,7 +96,7 @@ class Frame:
         return [Link(href, self.translate(key), self.path in own) for href, key, _, own in shown]
 
     def more(self) -> list[Link]:
-        """The screens behind the last entry of the bar."""
+        """Links to the screens that the last entry of the navigation opens."""
         return self.links(MORE)
 
     def length(self, value: float | str | None, unit: str = "µm", decimals: int | None = None) -> str:

@@ -40,7 +40,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return one column of readings per function. A function displaces the tool along one axis, and is zero while the cup is set up."""
+        """Return one column of readings per function, which displaces the tool along an axis and has to be 0 where a cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:

@@ -44,7 +44,7 @@ def spike(path: Path, key: str, values: Values) -> F2:
 
 
 def _unlike(path: Path, key: str, values: Values) -> F2:
-    """Return the spike times the direction of motion, for spikes of different height at the two ends of the axis."""
+    """Return the spike multiplied by the direction of motion (+1, -1): its height then differs between the two ends of the axis."""
     return _read(path, key, _decay(path, key, values) * path.at.sign[:, axis_of(key)])
 
 

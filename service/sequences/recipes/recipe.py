@@ -92,10 +92,11 @@ def joined(arcs: tuple[Array, Array, Array]) -> Path:
 class Helix(CupTest):
     """Hemispherical helix of the ball-bar test: continuous at constant feed, from pole to equator or (direction -1) back.
 
-    ``chord_mm`` is the wanted mean spacing of the path's points; a long path gets longer chords to fit into the controller's memory. The
-    polyline of n points then runs chord^2 / (8 radius) inside the sphere (1.3 um for a radius of 750 mm), and with ``law`` "area"
-    radius / (4 n) near the pole (23 um). Columns and solvers use the commanded position on the polyline, not on the sphere: this costs
-    accuracy only if the position of a sample is uncertain by a part of a chord. ``even``: almost equal spacing along the same curve.
+    ``chord_mm`` is the wanted mean spacing of the path's points; a long path gets longer chords to fit into the controller's memory.
+    Between its n points the polyline lies inside the sphere, by up to c^2 / (8 radius) with c the real chord (1.3 um for a radius of
+    750 mm); near the pole by radius / (4 n) if ``law`` is "area" (23 um). Columns and solvers use the commanded position on the polyline,
+    not on the sphere: this costs accuracy only if the position of a sample is uncertain by a part of a chord. ``even``: almost equal
+    spacing along the same curve.
     ``feed_in_deg`` and ``feed_out_deg``: arcs of the great circles tangent to the path's ends, driven continuously with it, so that the
     recorded part is at constant feed; ``feed_in_deg`` comes first in either direction.
     """

@@ -100,8 +100,8 @@ def _marks(key: str, changes: Sequence[datetime], known: Sequence[AlarmSummary])
 def trend_series(chart: FigureChart, points: Sequence[Point], zone: tzinfo, marks: Sequence[tuple[datetime, str, str, str]]) -> Doc:
     """Data of the script: points, control chart, forecast and marks of a figure in the reader's unit; times in s since 1970.
 
-    ``value``, ``u``: as text, rounded together, between spaces; ``bare``: indices and values of the points without U. Columns
-    of the chart have one entry for each point, None without a value.
+    ``value``, ``u``: one text each for all points, separated by spaces; a value and its U are rounded together. ``bare``: pairs of index
+    and value of the points without U. Columns of the chart have one entry for each point, None without a value.
     """
     frame = current()
     name, unit = language.figure(frame.lang, chart.figure)
