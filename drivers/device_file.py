@@ -214,7 +214,7 @@ class DeviceFile(DeviceTable):
             if missing := sorted(set(self.values) - groups):
                 raise ValueError(f"line.pattern has no group (?P<{missing[0]}>...) for values.{missing[0]}")
             if (self.line.mode == "poll") != bool(self.line.ask):
-                raise ValueError("line.ask is the request of a poll; a stream has none")
+                raise ValueError('line.ask: expected a request with mode = "poll", and none with mode = "stream"')
             if self.line.who and not self.line.answers:
                 raise ValueError("line.who needs line.answers")
             return

@@ -164,11 +164,13 @@ async def _answered(name: str, operation: str, answer: Awaitable[T]) -> T:
         async with asyncio.timeout(ANSWER_S):
             return await answer
     except TimeoutError:
-        raise ReplyTimeout(name, operation, f"no answer within {ANSWER_S:g} s") from None
+        raise ReplyTimeout(name, operation, f"no answer within {ANSWER_S:g} s", "check that the server is on") from None
     except OSError as error:
-        raise LinkDown(name, operation, str(error), "is the server switched on?") from None
+        raise LinkDown(name, operation, str(error), "check that the server is on, and its address") from None
     except ua.UaError as error:
-        raise BadFrame(name, operation, str(error) or type(error).__name__, "do the nodes of the URL belong to this server?") from None
+        raise BadFrame(
+            name, operation, str(error) or type(error).__name__, "check that the nodes in the URL belong to this server"
+        ) from None
 
 
 async def _ended(client: Any) -> None:

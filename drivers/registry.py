@@ -150,7 +150,9 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
         detail = f"the driver {entry.value} cannot be loaded: {type(fault).__name__}: {fault}"
         raise BadUrl(ascii(url), "open device", detail, remedy) from fault
     if not isinstance(driver, Mapping) or not callable(driver.get(role)):
-        raise BadUrl(ascii(url), "open device", f"the driver {entry.value} opens no {role}", "is this the right device for this key?")
+        raise BadUrl(
+            ascii(url), "open device", f"the driver {entry.value} opens no {role}", f"name a driver for {role} under [devices] {role}"
+        )
     bare, report = split_report(url)
     device = await driver[role](bare)
     needed = {name for name in dir(ROLES[role]) if name[0] != "_"}

@@ -395,7 +395,9 @@ class SerialBallBar:
             yield batch
         # Silence: a restarted box is idle. Check for that, so that the error names the true reason.
         await self._box.check_boot()
-        raise ReplyTimeout(self.name, "read samples", f"no sample for {timeout_s:g} s", "box switched off, or stopped by another program?")
+        raise ReplyTimeout(
+            self.name, "read samples", f"no sample for {timeout_s:g} s", "check that the box is on, and that no other program stops it"
+        )
 
     async def _ready(self) -> None:
         await self._box.check_boot()

@@ -371,14 +371,19 @@ class Conversation:
         """
         answer = await self._ask(identify_command, "identify")
         if not isinstance(answer, Info):
-            raise BadFrame(self._name, "identify", "an ACK came instead of the INFO", "is this a ball-bar box of protocol version 1?")
+            raise BadFrame(
+                self._name,
+                "identify",
+                "an ACK came instead of the INFO",
+                "check that the device at this port is a ball-bar box of protocol version 1",
+            )
         return answer
 
     async def settings(self) -> BoxSettings:
         """Read the settings of the box (firmware 1.1 and later); errors as for ``identify``."""
         answer = await self._ask(read_settings_command, "read settings")
         if not isinstance(answer, BoxSettings):
-            raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "is the firmware really 1.1 or later?")
+            raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "update the box's firmware to 1.1 or later")
         return answer
 
     async def command(self, kind: int, make: Callable[[int], bytes]) -> None:
@@ -394,9 +399,9 @@ class Conversation:
         operation = _OPERATION[kind]
         answer = await self._ask(make, operation)
         if not isinstance(answer, Ack) or answer.command != kind:
-            raise BadFrame(self._name, operation, "the reply belongs to another command", "is another program talking to this box?")
+            raise BadFrame(self._name, operation, "the reply belongs to another command", "end every other program that uses this box")
         if answer.result:
-            remedy = "does the box support this rate?" if kind == START else "check the settings at the box"
+            remedy = "choose a rate that the box supports" if kind == START else "check the settings at the box"
             raise Refused(self._name, operation, ACK_TEXT.get(answer.result, f"result {answer.result}"), remedy)
 
     def answered(self, frame: Answer) -> None:
@@ -428,9 +433,11 @@ class Conversation:
                 raise
             if self._counters.bad_bytes > bad and self._counters.frames == understood:
                 detail = f"{self._counters.bad_bytes - bad} bytes came, but no valid frame of a ball-bar box"
-                raise BadFrame(self._name, operation, detail, "baud rate and parity as on the box? is it a ball-bar box at all?") from None
+                raise BadFrame(
+                    self._name, operation, detail, "set baud rate and parity as on the box; check that it is a ball-bar box"
+                ) from None
             detail = f"no answer within {self._answer_s():g} s"
-            raise ReplyTimeout(self._name, operation, detail, "box on? baud rate and port right?") from None
+            raise ReplyTimeout(self._name, operation, detail, "switch the box on; check port and baud rate in its URL") from None
         finally:
             self._open.pop(tag, None)
 

@@ -153,7 +153,7 @@ class Banks(ControllerSession):
                 boot_id, gen = before
                 return reg.decode_comp_status(words, boot_id=boot_id, gen=gen)
         detail = f"the tables changed during each of {_SEQLOCK_TRIES} reads"
-        raise DeviceFault(self.name, "read compensation status", detail, "is another program or the operator editing tables?")
+        raise DeviceFault(self.name, "read compensation status", detail, "let no other program and no operator edit tables meanwhile")
 
     async def write_bank(self, bank: int, data: bytes, *, first: int = 0) -> None:
         """Write into the inactive bank from register ``first`` (even) on, in requests of up to 100 registers that never split a value.
@@ -292,7 +292,7 @@ class Banks(ControllerSession):
         length = header[_LENGTH_WORD]
         if header[0] != _MAGIC or not _HEADER_WORDS <= length <= reg.BANK_REGISTERS:
             detail = f"bank {bank} holds no image (magic {header[0]:#06x}, length {length})"
-            raise BadFrame(self.name, "read bank", detail, "empty or half written: give the number of bytes to read it anyway")
+            raise BadFrame(self.name, "read bank", detail, "the bank is empty or half written: give the number of bytes to read it anyway")
         return length
 
     def _within(self, operation: str, first: int, n_bytes: int) -> None:

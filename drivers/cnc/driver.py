@@ -78,12 +78,19 @@ class ModbusController(Banks):
         except TimeoutError as error:
             if isinstance(error, DriverError):
                 raise
-            late = ReplyTimeout(self.name, operation, f"not in position after {timeout_s:g} s, feed hold set", "override at 0?")
+            late = ReplyTimeout(
+                self.name,
+                operation,
+                f"not in position after {timeout_s:g} s; Abbe set feed hold",
+                "check that the feed override is not at zero",
+            )
             raise _with_notes(late, error) from None
 
     def _at_target(self, block: reg.StatusBlock, operation: str, target_mm: Point) -> ControllerStatus:
         if self._counts(block.status.position_mm, operation) != self._counts(target_mm, operation):
-            detail = f"the {operation} ended at {block.status.position_mm} instead of {tuple(target_mm)}: aborted"
+            detail = (
+                f"the {operation} ended at {block.status.position_mm} mm instead of {tuple(target_mm)} mm: somebody or something aborted it"
+            )
             raise DeviceFault(self.name, operation, detail, "find the reason, then start again")
         return block.status
 
@@ -107,7 +114,7 @@ class ModbusController(Banks):
         block = await self.block()
         if block.fifo_free != self.fifo_size - len(points):
             detail = f"{self.fifo_size - block.fifo_free} points arrived instead of {len(points)}"
-            raise DeviceFault(self.name, "load path", detail, "is another program loading a path? load it again")
+            raise DeviceFault(self.name, "load path", detail, "end every other program that loads paths, then load the path again")
 
     async def start_path(self, *, feed_mm_min: float) -> None:
         """Start the loaded path at constant feed (mm/min) and return as soon as it runs; ``status`` shows its progress.
@@ -197,7 +204,7 @@ class ModbusController(Banks):
             block = await self.block()
             reasons = reg.interlocks(block.status.conditions)  # an open door may also show as feed hold: report the door
             if Condition.FEED_HOLD in block.status.conditions and not reasons and command in (reg.MOVE, reg.TOUCH, reg.PATH_START):
-                raise Refused(self.name, operation, "feed hold is on", "release it or abort the motion, when it is safe")
+                raise Refused(self.name, operation, "feed hold is on", "when it is safe, release feed hold or abort the motion")
             number = next_number(block.motion_ack_seq)
             try:
                 words = reg.encode_motion(number, command, target, feed_mm_min)
@@ -215,7 +222,7 @@ class ModbusController(Banks):
         if result:
             detail = reg.MOTION_RESULT.get(result, f"result {result}") + (f": {', '.join(reasons)}" if reasons else "")
             # HOLD_REQUEST at 2 forbids motion without showing in the status
-            unseen = "was an abort not finished? abort again; else " if result == _INTERLOCK and not reasons else ""
+            unseen = "abort once more, in case an earlier abort was not finished; then " if result == _INTERLOCK and not reasons else ""
             raise Refused(self.name, operation, detail, f"{unseen}look at the machine, then try again")
         return number
 
@@ -227,21 +234,26 @@ class ModbusController(Banks):
             if block.motion_done_seq == number:
                 return block
             if Condition.FEED_HOLD in block.status.conditions:
-                raise _MotionStopped(self.name, "move", "stopped by feed hold", "release it or abort the motion, when it is safe")
+                raise _MotionStopped(self.name, "move", "stopped by feed hold", "when it is safe, release feed hold or abort the motion")
             if block.motion_ack_seq != number:
-                detail = f"command {number} was overtaken by {block.motion_ack_seq}"
-                raise DeviceFault(self.name, "move", detail, "is another program moving this machine?")
+                detail = f"command {block.motion_ack_seq} replaced command {number}, which was not finished"
+                raise DeviceFault(self.name, "move", detail, "end every other program that moves this machine")
             await asyncio.sleep(_POLL_S)
 
     def _check(self, block: reg.StatusBlock) -> None:
         conditions = block.status.conditions
         if Condition.ESTOP in conditions:
-            raise DeviceFault(self.name, "move", "e-stop pressed", "release it, reset the alarm, reference if asked, start again")
+            raise DeviceFault(
+                self.name,
+                "move",
+                "e-stop pressed",
+                "release the e-stop, reset the alarm, reference the axes if the control asks for it, then start again",
+            )
         if Condition.ALARM in conditions or block.alarm_code:
             what = reg.ALARM.get(block.alarm_code, f"code {block.alarm_code}")
-            raise DeviceFault(self.name, "move", f"alarm: {what}", "clear its cause and reset it at the controller")
+            raise DeviceFault(self.name, "move", f"alarm: {what}", "remove the cause of the alarm, then reset the alarm at the controller")
         if Condition.DOOR_OPEN in conditions:
-            raise DeviceFault(self.name, "move", "door opened", "close it and start again")
+            raise DeviceFault(self.name, "move", "door opened", "close the door, then start again")
 
     async def _chunk(self, points: list[tuple[int, int, int]], operation: str) -> None:
         async with self._commands:

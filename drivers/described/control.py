@@ -65,7 +65,7 @@ class ListenedControl:
         snapshot = await self.source.snapshot()
         found = meanings(self.file, snapshot.counts)
         if wrong := found & {"fault", "out of range"}:
-            raise DeviceFault(self.name, "read status", ", ".join(sorted(wrong)), "look at the device")
+            raise DeviceFault(self.name, "read status", ", ".join(sorted(wrong)), "clear this condition at the device")
         holds = NOTHING_HOLDS
         for meaning in found & CONDITIONS.keys():
             holds |= CONDITIONS[meaning]
@@ -85,10 +85,10 @@ class ListenedControl:
             self._counted = (count, snapshot.host_s)
         elif snapshot.host_s - self._counted[1] > STUCK_S + (0.0 if self.file is None else self.file.limits.update_s or 0.0):
             detail = f"its counter is stuck at {count:g}: the device repeats old positions"
-            raise ReplyTimeout(self.name, "read status", detail, "does its program run?")
+            raise ReplyTimeout(self.name, "read status", detail, "check that the program in the device runs")
 
     def _refuse(self, operation: str, what: str) -> NoReturn:
-        raise NotProved(self.name, operation, f"Abbe can only read this control: {what}", "connect a control that proves it")
+        raise NotProved(self.name, operation, f"Abbe can only read this control: {what}", "use a control with a driver that can do this")
 
     async def comp_status(self) -> CompStatus:
         """Raise NotProved: no compensation table is visible."""

@@ -42,8 +42,8 @@ class LineSource:
         found = await self._ask(table.who, table.answers)
         serial = (found or {}).get("serial_no", "")
         if found is None or (self._serial is not None and serial != self._serial):
-            detail = "its answer to the question for its identity is not that of the device file" if found is None else "another device"
-            error = WrongDevice(self.name, "identify", detail, "is this the device that the device file describes?")
+            detail = "its identity is not the one in the device file" if found is None else "another device"
+            error = WrongDevice(self.name, "identify", detail, "connect the device that the device file describes")
             self.incidents.note(error, latched=True)
             raise error
         self._serial = serial
@@ -95,7 +95,12 @@ class LineSource:
             except ReplyTimeout:
                 return
         await self._link.close()
-        raise LinkDown(self.name, "wait for silence", "the line never falls silent", "does the device stream? baud rate right?")
+        raise LinkDown(
+            self.name,
+            "wait for silence",
+            "the line is never silent",
+            'write mode = "stream" in its device file, or check the baud rate',
+        )
 
     async def _line(self) -> tuple[float, str]:
         """Return the arrival and the text of the next line. Raises ReplyTimeout, LinkDown, or BadFrame for bytes that are not a line."""
@@ -109,15 +114,20 @@ class LineSource:
                         break
         except TimeoutError:
             if not data:
-                detail, remedy = f"no line within {self._table.timeout_s:g} s", "device on? cable, baud rate and question right?"
+                detail, remedy = (
+                    f"no line within {self._table.timeout_s:g} s",
+                    "check that the device is on, the cable, the baud rate and the request",
+                )
                 raise ReplyTimeout(self.name, "read", detail, remedy) from None
         if ends not in data:
-            raise BadFrame(self.name, "read", f"bytes without an end of line: {data[:40]!r}", "baud rate, parity and end of line right?")
+            raise BadFrame(self.name, "read", f"bytes without an end of line: {data[:40]!r}", "check baud rate, parity and line.ends")
         return host_s, decoded(data.partition(ends)[0])
 
     def _raise_error(self, line: str) -> None:
         if self._table.error and (found := re.fullmatch(self._table.error, line)):
-            raise DeviceFault(self.name, "read", f"the device reports {' '.join(found.groups()) or line!r}", "see its manual")
+            raise DeviceFault(
+                self.name, "read", f"the device reports {' '.join(found.groups()) or line!r}", "look this error up in the device's manual"
+            )
 
     def _counts(self, line: str) -> dict[str, float]:
         """Return the values of a line. Raises DeviceFault for a line that reports an error, BadFrame for any other line."""
@@ -128,7 +138,12 @@ class LineSource:
                 return {name: float(found[name].replace(" ", "")) for name in self._file.values}
         except (ValueError, AttributeError):  # a group is empty, or not a number
             pass
-        raise BadFrame(self.name, "read", f"the line {line[:60]!r} does not match the device file", "baud rate, parity, output format?")
+        raise BadFrame(
+            self.name,
+            "read",
+            f"the line {line[:60]!r} does not match the device file",
+            "check baud rate, parity and the device's output format",
+        )
 
     async def close(self) -> None:
         """Close the port. Closing twice does nothing."""
@@ -196,7 +211,8 @@ class StreamedLines(LineSource):
     def __init__(self, file: DeviceFile, link: ByteLink) -> None:
         super().__init__(file, link)
         if file.line is not None and (file.line.who or file.zero or file.clear):
-            raise NotProved(self.name, "open", "a device that streams takes no requests or commands", "describe it as a poll")
+            detail = 'its device file has mode = "stream", but also line.who, [zero] or [clear], and a stream takes no requests'
+            raise NotProved(self.name, "open", detail, 'remove these from the device file, or write mode = "poll"')
         self._task: asyncio.Task[None] | None = None
         self._news = asyncio.Condition()
         self._latest: CountSnapshot | None = None
@@ -227,7 +243,10 @@ class StreamedLines(LineSource):
             async with asyncio.timeout(self._table.timeout_s), self._news:
                 await self._news.wait_for(lambda: self._number > self._given or isinstance(self._trouble, LinkDown | DeviceFault))
         except TimeoutError:
-            detail, remedy = f"no line within {self._table.timeout_s:g} s", "device on and streaming? cable and baud rate right?"
+            detail, remedy = (
+                f"no line within {self._table.timeout_s:g} s",
+                "check that the device is on and sends, the cable and the baud rate",
+            )
             error = self._trouble or ReplyTimeout(self.name, "read", detail, remedy)
             self.incidents.note(error)
             raise error from None

@@ -74,13 +74,13 @@ class DescribedMeter:
         """
         snapshot = await self._new(self._not_before)
         if bad := meanings(self.file, snapshot.counts) & INVALID:
-            raise DeviceFault(self.name, "zero", ", ".join(sorted(bad)), "free beam or plunger first")
+            raise DeviceFault(self.name, "zero", ", ".join(sorted(bad)), "clear the beam or free the plunger, then zero the instrument")
         if self.file.zero is not None:
             await self._command(self.file.zero, "zero")
             snapshot = await self._new(self._not_before)
             found_mm = physical(self.file, snapshot.counts, "displacement")
             if not abs(found_mm) < ZEROED_MM:
-                raise Refused(self.name, "zero", f"it reads {found_mm:.4f} mm after its zero command", "does the command fit the device?")
+                raise Refused(self.name, "zero", f"it reads {found_mm:.4f} mm after its zero command", "correct [zero] in the device file")
             self._zero_mm = 0.0
         else:
             self._zero_mm = physical(self.file, snapshot.counts, "displacement")
@@ -102,12 +102,17 @@ class DescribedMeter:
             Communication failed, or the command is not acknowledged.
         """
         if on and self.file.air == "vacuum":
-            detail = "it does not correct its wavelength for the air: lengths would be some 270 ppm too large"
-            raise NotProved(self.name, "switch environmental compensation", detail, "use an instrument that compensates")
+            detail = "the device does not correct its wavelength for the air: lengths would be some 270 ppm too large"
+            raise NotProved(self.name, "switch environmental compensation", detail, "use an instrument that corrects for the air")
         if on and self.file.compensate is not None:
             await self._command(self.file.compensate, "switch environmental compensation")
         if not on and self.file.air == "compensated":
-            raise NotProved(self.name, "switch environmental compensation", "it cannot be switched off", "measure with it")
+            raise NotProved(
+                self.name,
+                "switch environmental compensation",
+                "the device cannot stop correcting for the air",
+                "measure with this correction",
+            )
 
     async def read(self, *, after_count: int | None = None) -> LaserReading:
         """Wait for a reading after the last zero and after sample number ``after_count`` (None: any), and return it.
@@ -127,9 +132,13 @@ class DescribedMeter:
         bad = meanings(self.file, snapshot.counts) & INVALID
         reading = self._reading(snapshot)
         if bad:
-            raise DeviceFault(self.name, "read", ", ".join(sorted(bad)), "free beam or plunger, zero it, then repeat this test")
+            raise DeviceFault(
+                self.name, "read", ", ".join(sorted(bad)), "clear the beam or free the plunger, zero the instrument, then repeat this test"
+            )
         if self._zero_mm is None:
-            raise DeviceFault(self.name, "read", "not zeroed since it was opened or lost its position", "zero it, then repeat this test")
+            raise DeviceFault(
+                self.name, "read", "not zeroed since it was opened or lost its position", "zero the instrument, then repeat this test"
+            )
         return reading
 
     async def peek(self) -> LaserReading:
@@ -161,7 +170,9 @@ class DescribedMeter:
             if clock() - begun_s > NEW_S + (update_s or 0.0):
                 what = "counter" if "counter" in self.file.values else "time stamp"
                 detail = f"its {what} is stuck at {snapshot.counts['counter' if what == 'counter' else 'time']:g} for {NEW_S:g} s"
-                raise ReplyTimeout(self.name, "read", f"{detail}: the device repeats an old reading", "is it measuring? restart it")
+                raise ReplyTimeout(
+                    self.name, "read", f"{detail}: the device repeats an old reading", "restart the instrument's measurement"
+                )
 
     def _counted(self, snapshot: CountSnapshot) -> int:
         """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else ours."""
@@ -186,8 +197,8 @@ class DescribedMeter:
         self._raw[name] = raw
         if before is not None and (step < 0 or (soon and step > size / 2)):
             self._zero_mm = None
-            detail = f"its {name} went back from {before:.10g} to {raw:.10g}: it restarted, or an old reply came late"
-            raise Rebooted(self.name, "read", detail, "zero it, then measure this test again")
+            detail = f"its {name} went back from {before:.10g} to {raw:.10g}: the device restarted, or an old reply came late"
+            raise Rebooted(self.name, "read", detail, "zero the instrument, then measure this test again")
         self._total[name] = self._total.get(name, 0.0) + step
         return step
 
@@ -195,7 +206,7 @@ class DescribedMeter:
         found = meanings(self.file, snapshot.counts)
         mm = physical(self.file, snapshot.counts, "displacement")
         if not math.isfinite(mm):
-            raise DeviceFault(self.name, "read", f"the displacement reads {mm}", "is a sensor connected?")
+            raise DeviceFault(self.name, "read", f"the displacement reads {mm}", "check that a sensor is connected to the instrument")
         limits = self.file.limits.range_mm
         if limits is not None and not limits[0] <= mm <= limits[1]:
             found |= {"out of range"}

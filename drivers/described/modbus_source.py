@@ -122,14 +122,16 @@ class ModbusSource:
         while (found := await self._one(address, command.function)) != command.becomes:
             if clock() > until_s:
                 detail = f"not acknowledged: register {address} holds {found}, not {command.becomes}, after {command.within_s:g} s"
-                raise ReplyTimeout(self.name, operation, detail, "does the device refuse it? does the device file fit?")
+                raise ReplyTimeout(
+                    self.name, operation, detail, "check that the device allows this command, and correct it in the device file"
+                )
             await asyncio.sleep(_POLL_S)
 
     async def _same_device(self) -> None:
         await self._check_identity()
         boot = await self._optional(self._file.boot)
         if boot != self._boot and self._boot is not None:
-            error = Rebooted(self.name, "read", "the device restarted", "connect to it again, zero it, then measure this test again")
+            error = Rebooted(self.name, "read", "the device restarted", "connect again, zero the device, then measure this test again")
             self.incidents.note(error, latched=True)
             raise error
         self._epoch += boot is None
@@ -185,4 +187,4 @@ def _why(known: IdentityRegisters, words: tuple[int, ...], order: Order) -> tupl
             f"{detail}: its byte order is {fits[0]} ({ORDER_NAMES[fits[0]]}), not {order}",
             f'write order = "{fits[0]}" in the device file',
         )
-    return detail, "do address and unit number really belong to this device? does the device file fit it?"
+    return detail, "check address, unit number and device file: one of them belongs to another device"

@@ -167,7 +167,7 @@ class ModbusLaser:
                 raise
             floor = self._shown_at_command if after_count is None else after_count
             detail = f"no sample after number {floor} within {self._read_timeout_s:g} s"
-            raise ReplyTimeout(self.name, "read", detail, "is the meter measuring?") from None
+            raise ReplyTimeout(self.name, "read", detail, "start the meter's measurement") from None
         self._shown_at_command = None
         self._check_beam(reading.status)
         return reading
@@ -200,7 +200,7 @@ class ModbusLaser:
             self._boot_id = counts["BOOT_ID"]
         if counts["BOOT_ID"] != self._boot_id:
             detail = f"boot id {counts['BOOT_ID']:#x} instead of {self._boot_id:#x}"
-            error = Rebooted(self.name, "read", detail, "the meter restarted: connect to it again, zero it, then measure this test again")
+            error = Rebooted(self.name, "read", detail, "the meter restarted: connect again, zero the meter, then measure this test again")
             self._link.incidents.note(error, latched=True)
             raise error
         self._connection = self._link.connections
@@ -222,7 +222,9 @@ class ModbusLaser:
                 self.name, "read", f"beam lost ({what})", "free the beam, clear the loss, zero the meter, then repeat this test"
             )
         if not is_zeroed(status):
-            raise DeviceFault(self.name, "read", "not zeroed since it was switched on or lost the beam", "zero it, then repeat this test")
+            raise DeviceFault(
+                self.name, "read", "not zeroed since it was switched on or lost the beam", "zero the meter, then repeat this test"
+            )
 
     async def _command(self, command: int, argument: int, operation: str) -> None:
         async with self._command_lock:
@@ -235,7 +237,9 @@ class ModbusLaser:
 
             result = await run_numbered(self.name, operation, number, write, self._read_ack)
         if result:
-            raise Refused(self.name, operation, RESULT_TEXT.get(result, f"result {result}"), "free the beam and clear its loss first")
+            raise Refused(
+                self.name, operation, RESULT_TEXT.get(result, f"result {result}"), "free the beam and clear its loss, then try again"
+            )
         self._shown_at_command = (await self._read_once()).sample_count
 
     async def _read_ack(self) -> tuple[int, int]:

@@ -197,7 +197,7 @@ class ModbusWire:
         except TimeoutError:
             raise self._why(request, timeout_s) from None
         except ModbusException as trouble:
-            raise LinkDown(self.name, str(request), str(trouble), "device and network on?") from trouble
+            raise LinkDown(self.name, str(request), str(trouble), "check that device and network are on") from trouble
         finally:
             self._deadline = None
         if me.cancelling() > cancels:  # lost in pymodbus, see `open`
@@ -245,13 +245,13 @@ class ModbusWire:
     def _why(self, request: Request, timeout_s: float) -> DriverError:
         if self._complaint:
             detail = f"the reply does not fit the request: {self._complaint} [{self._heard[:40].hex(' ')}]"
-            return BadFrame(self.name, str(request), detail, "line noise, a second master, or another device than expected?")
+            return BadFrame(self.name, str(request), detail, "look for line noise, a second Modbus master or a wrong device")
         if self._lost or not self.up:
-            return LinkDown(self.name, str(request), "the connection was closed", "device restarted, or cable unplugged?")
+            return LinkDown(self.name, str(request), "the connection was closed", "check the cable, and whether the device restarted")
         if self._heard:
             detail = f"no valid reply, only [{self._heard[:40].hex(' ')}]"
-            return BadFrame(self.name, str(request), detail, "line noise? unit and baud right?")
-        return ReplyTimeout(self.name, str(request), f"no reply within {timeout_s:g} s", "device on? unit number right?")
+            return BadFrame(self.name, str(request), detail, "check unit number and baud rate; look for line noise")
+        return ReplyTimeout(self.name, str(request), f"no reply within {timeout_s:g} s", "check that the device is on, and its unit number")
 
     def _new_client(self, timeout_s: float) -> AsyncModbusTcpClient | AsyncModbusSerialClient:
         # Always a new object: the library's connection state does not survive every kind of loss. reconnect_delay=0 is the documented and
@@ -292,12 +292,12 @@ class ModbusWire:
 
     def _remedy(self) -> str:
         if isinstance(self._url, ModbusTcpUrl):
-            return "address and port right? device on? does another program hold the only connection it allows?"
+            return "check address and port, that the device is on, and that no other program holds its only connection"
         path = self._url.path
         if not os.path.exists(path):
-            return "adapter plugged in? device path right?"
+            return "plug the adapter in, or correct the path of the port"
         return (
-            "does another program hold the port?"
+            "close the other program that may hold the port"
             if os.access(path, os.R_OK | os.W_OK)
             else "no permission: add this user to the port's group"
         )

@@ -182,7 +182,7 @@ class ModbusLine:
             if self._wire.strays or not await self._proven(self._canary, 0):
                 self.dirty = True
                 detail = "a reply came, but the canary read after it was wrong: the reply may be stale"
-                raise BadFrame(self._name, str(request), detail, "second master on the line, line noise, or a slow device?")
+                raise BadFrame(self._name, str(request), detail, "look for a second Modbus master, line noise or a slow device")
         return answer
 
     async def _asked(self, request: Request) -> ModbusReply:
@@ -206,7 +206,9 @@ class ModbusLine:
             if not self._wire.up:
                 break
         detail = f"the canary registers were wrong {_PROOFS} times"
-        raise LinkDown(self._name, "verify the line after a disturbance", detail, "second master on the line, or device off?")
+        raise LinkDown(
+            self._name, "verify the line after a disturbance", detail, "check that the device is on; look for a second Modbus master"
+        )
 
     async def _silence(self) -> None:
         clock = asyncio.get_running_loop().time
@@ -214,7 +216,7 @@ class ModbusLine:
         while (left_s := max(start, self._wire.heard_at) + self._timeout_s - clock()) > 0:
             if self.closing or clock() - start > _BABBLE_LIMIT * self._timeout_s:
                 await self._wire.drop()
-                detail, remedy = "the line never falls silent", "second master on the line, or wrong baud rate?"
+                detail, remedy = "the line is never silent", "check the baud rate; look for a second Modbus master on the line"
                 raise LinkDown(self._name, "wait for silence", detail, remedy)
             await asyncio.sleep(left_s)
 
@@ -457,7 +459,9 @@ class ModbusLink:
         left_s = self._backoff.left_s()
         if left_s > patience_s:
             detail = f"no connection; next attempt in {left_s:.1f} s"
-            raise LinkDown(self.name, "connect", detail, "device on? network or cable all right? another program connected to it?")
+            raise LinkDown(
+                self.name, "connect", detail, "check that the device is on, cable and network, and that no other program uses it"
+            )
         await self._backoff.due()
         self._backoff.attempted()
         await self._line.open()

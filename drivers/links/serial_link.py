@@ -78,9 +78,11 @@ async def connected(url: SocketUrl) -> socket.socket:
         async with asyncio.timeout(_CONNECT_S):
             return await _connect_any(url)
     except TimeoutError:
-        raise LinkDown(str(url), "open", f"no connection within {_CONNECT_S:g} s", "address right? device and network on?") from None
+        raise LinkDown(
+            str(url), "open", f"no connection within {_CONNECT_S:g} s", "check the address, and that device and network are on"
+        ) from None
     except OSError as error:
-        raise LinkDown(str(url), "open", str(error), "address and port right? device server running?") from error
+        raise LinkDown(str(url), "open", str(error), "check address and port, and that the device server runs") from error
 
 
 async def _connect_any(url: SocketUrl) -> socket.socket:
@@ -108,7 +110,7 @@ async def _connect_any(url: SocketUrl) -> socket.socket:
 _DRAIN_S = 0.5
 _POLL_S = 0.01
 _PARITY = {"none": serial.PARITY_NONE, "even": serial.PARITY_EVEN, "odd": serial.PARITY_ODD}
-_UNPLUGGED = "cable or adapter unplugged? check it, then try again"
+_UNPLUGGED = "check whether cable or adapter is unplugged, then try again"
 
 
 class ByteLink:
@@ -182,7 +184,9 @@ class ByteLink:
                         continue
                     break
         except TimeoutError:
-            raise ReplyTimeout(self.name, "read", f"no byte within {timeout_s:g} s", "device switched on? baud rate right?") from None
+            raise ReplyTimeout(
+                self.name, "read", f"no byte within {timeout_s:g} s", "check that the device is on, and the baud rate"
+            ) from None
         except OSError as error:
             raise self._lost("read", error) from error
         if not data:
@@ -234,7 +238,10 @@ class ByteLink:
                         await self._ready(descriptor, loop.add_writer, loop.remove_writer)
         except TimeoutError:
             raise ReplyTimeout(
-                self.name, "write", f"the line accepted no bytes for {timeout_s:g} s", "flow control or adapter stuck?"
+                self.name,
+                "write",
+                f"the line accepted no bytes for {timeout_s:g} s",
+                "switch flow control off, or plug the adapter in again",
             ) from None
         except OSError as error:
             raise self._lost("write", error) from error
@@ -348,9 +355,9 @@ def serial_remedy(path: str, error: Exception) -> str:
     """Return the remedy for a serial port that does not open."""
     number = getattr(error, "errno", None)
     if number == errno.ENOENT or not os.path.exists(path):
-        return "adapter plugged in? device path right? prefer the by-id link of the adapter"
+        return "plug the adapter in, or correct the path of the port; best is the adapter's link in /dev/serial/by-id"
     if number in (errno.EACCES, errno.EPERM) or not os.access(path, os.R_OK | os.W_OK):
         return "no permission: add this user to the group that owns the port (often dialout)"
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error):
         return "another program holds the port: close it"
-    return "is this really a serial port, and does it support this baud rate?"
+    return "check that this is a serial port, and that it supports this baud rate"

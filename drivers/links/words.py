@@ -98,7 +98,7 @@ _ORDER_NAMES = {
     "DCBA": "registers and bytes are swapped (DCBA)",
 }
 _SET_ORDER = "set the device to big-endian, high word first (ABCD)"
-_WHO = "do address and unit number really belong to this device?"
+_WHO = "check address and unit number: they may belong to another device"
 _LONGEST_US = 100 * 365 * 86400 * 10**6
 
 
@@ -181,7 +181,7 @@ async def run_numbered(
         write_error.add_note(f"afterwards the acknowledge shows that command {number} was not executed (last executed: {acknowledged})")
         raise write_error
     detail = f"command {number} is not acknowledged (last executed: {acknowledged})"
-    raise ReplyTimeout(device, operation, detail, "is another program sending commands to this device?")
+    raise ReplyTimeout(device, operation, detail, "end every other program that sends commands to this device")
 
 
 async def _last_ack(number: int, read_ack: Callable[[], Awaitable[tuple[int, int]]], settle_s: float) -> tuple[int, int]:

@@ -170,8 +170,8 @@ def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping
         for big in sorted(effects, key=lambda e: -e.evidence):
             share = _share(small, big, big.label in scatter)
             if small.evidence < share * big.evidence:
-                share_text = f"{small.evidence:.0f} nats, {small.evidence / big.evidence:.1%} of {big.label}'s"
-                out[small.label] = f"{share_text}: it may be only the deviation of {big.label} from its formula"
+                share_text = f"evidence {small.evidence:.0f}, only {small.evidence / big.evidence:.1%} of that of {big.label}"
+                out[small.label] = f"{share_text}: possibly only the deviation of {big.label} from its formula"
                 break
     return out
 
@@ -301,7 +301,8 @@ def _judge(
     names = [*mean.values(), *scatter]
     small = {e.label: e.evidence for e in names if e.evidence < REST_SHARE * rest}
     left = {
-        label: f"{nats:.0f} nats, but {rest:.0f} nats have no explanation: it may be only a part of them" for label, nats in small.items()
+        label: f"evidence {own:.0f}, but {rest:.0f} is left without explanation: possibly only a part of that"
+        for label, own in small.items()
     }
     left = {**residues(names, frozenset(e.label for e in scatter)), **left}
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
@@ -312,9 +313,11 @@ def _judge(
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
-        rejected += [(e.label, f"{e.evidence:.0f} nats, less than the structures without a name: not named beside them") for e in effects]
+        rejected += [
+            (e.label, f"evidence {e.evidence:.0f}, less than that of the structures without a name: not named beside them") for e in effects
+        ]
     for i, j in companions.items():
-        share_text = f"{found[i].score / 2.0:.0f} nats: it may be only the deviation of {found[j].pick.label} from its formula"
+        share_text = f"evidence {found[i].score / 2.0:.0f}: possibly only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
     return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))

@@ -73,8 +73,8 @@ def lacking(location: Localization) -> Structure:
 
 
 def describe_structure(structure: Structure, *, beside: bool) -> str:
-    """Return e.g. ``144 nats, without a name: step of one axis, at 870 to 930 s``; ``beside``: named effects were found too."""
-    parts = [f"{structure.evidence:.0f} nats, without a name: {structure.title}", *_place(structure.location)]
+    """Return e.g. ``evidence 144, without a name: step of one axis, at 870 to 930 s``; ``beside``: named effects were found too."""
+    parts = [f"evidence {structure.evidence:.0f}, without a name: {structure.title}", *_place(structure.location)]
     return ", ".join(parts) + ("; the named effects do not explain this part of the gap" if beside else "")
 
 

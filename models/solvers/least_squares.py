@@ -129,7 +129,10 @@ def _solve_whitened(names: tuple[str, ...], b: F2, z: F1, ridge: F1) -> tuple[F1
     q, r, pivot = scipy.linalg.qr(np.concatenate([b, np.diag(ridge)]), mode="economic", pivoting=True)
     keep = np.abs(np.diag(r)) > 1e-12 * abs(r[0, 0])
     if not keep.all():
-        raise ValueError(f"least squares: no prior and no data for a combination with {names[int(pivot[np.flatnonzero(~keep)[0]])]}")
+        lost = names[int(pivot[np.flatnonzero(~keep)[0]])]
+        raise ValueError(
+            f"least squares: neither observations nor a prior determine {lost}, alone or with others: give {lost} a prior, or leave it out"
+        )
     n = len(names)
     x = np.empty(n)
     x[pivot] = scipy.linalg.solve_triangular(r, q.T @ np.concatenate([z, np.zeros(n)]))

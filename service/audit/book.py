@@ -95,13 +95,13 @@ def _anchor_faults(records: Sequence[AuditEvent], anchors: Sequence[Anchor], key
     found, stored = [], {record.id: record.digest for record in records}
     for anchor in anchors:
         if not hmac.compare_digest(anchor.mac, mac_of(key, f"{anchor.id} {anchor.digest}")):
-            found.append(f"the head kept for record {anchor.id} was not sealed by this service")
+            found.append(f"the checksum kept outside the database for record {anchor.id} was not sealed by this service")
         elif anchor.id not in stored:
             found.append(f"record {anchor.id} was written and is missing: the audit holds {len(records)} records")
         elif stored[anchor.id] != anchor.digest:
-            found.append(f"record {anchor.id} differs from the head kept for it")
+            found.append(f"record {anchor.id} differs from its checksum kept outside the database")
     if records and not anchors:
-        found.append("no heads are kept outside the database: removed records would not be noticed")
+        found.append("no checksums are kept outside the database: nobody would notice removed records")
     return found
 
 
@@ -254,7 +254,7 @@ class AuditBook:
             return [error.detail]
         found = faults(records, heads, key)
         if not records and not heads and not self._memory:
-            found.append(f"the audit is empty, but its key is here ({self.key_file}): all its records and heads were removed")
+            found.append(f"the audit is empty, but its key is here ({self.key_file}): somebody removed all its records and checksums")
         return found
 
     def _has_key(self) -> bool:
@@ -277,7 +277,7 @@ class AuditBook:
         except OSError as error:
             raise AuditBroken(
                 refusal(self.head_file, error).detail,
-                "the record is in the database, but this file lacks its head; make the file writable",
+                "the record is in the database, but this file lacks its checksum; make the file writable",
             ) from None
 
 

@@ -152,7 +152,7 @@ def read_backup(folder: Path) -> Backup:
     except (ValueError, AttributeError, Unusable) as err:
         raise BackupRefused(f"{folder / LIST} is damaged: {err}", "use another backup") from None
     if wrong:
-        how = "missing" if wrong[0] not in found else "not of this backup" if wrong[0] not in wanted else "not as it was written"
+        how = "missing" if wrong[0] not in found else "not part of this backup" if wrong[0] not in wanted else "changed since the backup"
         raise BackupRefused(f"{folder / wrong[0]} is {how}", "use another backup")
     return Backup(folder, listed)
 

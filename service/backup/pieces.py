@@ -76,11 +76,11 @@ def check(folder: Path, listed: ListedPieces) -> None:
     """Refuse a folder with a missing, damaged or additional piece, or with pieces of a wrong total size. Raises BackupRefused, OSError."""
     present = {path.name for path in folder.iterdir()} if folder.is_dir() else set()
     if more := sorted(present - set(listed.names)):
-        raise BackupRefused(f"{folder / more[0]} is not of this backup", "use another backup")
+        raise BackupRefused(f"{folder / more[0]} is not part of this backup", "use another backup")
     each = sorted(set(listed.names))
     sizes = dict(zip(each, map(len, _read(folder, each)), strict=True))
     if (found := sum(sizes[name] for name in listed.names)) != listed.bytes:
-        raise BackupRefused(f"the pieces in {folder} have {found} bytes, and their list says {listed.bytes}", "use another backup")
+        raise BackupRefused(f"the pieces in {folder} have {found} bytes, but their list says {listed.bytes} bytes", "use another backup")
 
 
 def _read(folder: Path, names: Sequence[str]) -> Iterator[bytes]:
@@ -91,4 +91,4 @@ def _read(folder: Path, names: Sequence[str]) -> Iterator[bytes]:
             if hashlib.sha256(data).hexdigest() == name:
                 yield data
                 continue
-        raise BackupRefused(f"{path} is {'not as it was written' if os.path.lexists(path) else 'missing'}", "use another backup")
+        raise BackupRefused(f"{path} is {'changed since the backup' if os.path.lexists(path) else 'missing'}", "use another backup")

@@ -367,8 +367,8 @@ def _too_few(run: Run, count: int) -> list[CampaignIssue]:
     if not 10 <= count < wanted:
         return []
     what = (
-        f"only {count} valid readings on {turns:g} turns ({wanted} are needed): "
-        "cup, bar length and lost motion use up most of their information"
+        f"only {count} valid readings on {turns:g} turns, expected {wanted} or more: "
+        "cup position, bar length and lost motion leave too few for the errors of the machine"
     )
     return [CampaignIssue(run.run_id, what, "measure it again with a higher rate", False)]
 

@@ -79,7 +79,9 @@ class BarPlaces:
         self.run_ids += ids
         columns = (await asyncio.to_thread(load_run, self.store, ids[0])).columns
         if not columns.valid.all():
-            raise MeasurementFault("the ball-bar gave no valid reading at some positions", "check the bar, then begin again")
+            raise MeasurementFault(
+                "the ball-bar gave no valid reading at some positions", "check that the bar sits in both cups, then begin again"
+            )
         return PlaceReadings(columns.q_mm, columns.readings_mm)
 
     def directions(self, readings: PlaceReadings) -> F2:

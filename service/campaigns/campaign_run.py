@@ -88,7 +88,8 @@ Confirm = Callable[[str], Awaitable[bool]]
 
 
 def _in_vain(why: SetupDisturbed | Interlock | RunInterrupted) -> SetupDisturbed | Interlock | RunInterrupted:
-    return type(why)(f"{why.detail}; {MOST_TRIES + 1} times in a row without a new point", why.remedy)
+    remedy = "find the cause at the machine, then resume: abbe measure -m MACHINE.toml --resume CAMPAIGN"
+    return type(why)(f"{why.detail}; {MOST_TRIES + 1} times in a row without a new point", remedy)
 
 
 async def decline(_: str) -> bool:
@@ -186,7 +187,7 @@ async def read_path(session: Session, store: Store, campaign: int, test: str, mo
 
 def halfway(item: Item) -> str:
     """Return the question to a person before an interrupted path resumes."""
-    return f"Set-up {item.setup} was left mounted, {item.test.label} half read. Is it still untouched?"
+    return f"Set-up {item.setup} was left mounted, and test {item.test.label} is only partly measured. Is the set-up still untouched?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -311,7 +312,7 @@ class CampaignRun:
         if item.resume_trail.carried:
             return True
         if (item.setup, item.mounting) in self.used:
-            return await self.confirm(f"Set-up {item.setup} was left mounted and has complete runs. Is it still untouched?")
+            return await self.confirm(f"Set-up {item.setup} was left mounted and has complete runs. Is the set-up still untouched?")
         return item.remainder is None or await self.confirm(halfway(item))
 
     def again_mounted(self, item: Item) -> Item:

@@ -218,7 +218,7 @@ async def measure(  # noqa: PLR0913 - what to measure, with what, and how
     control, resumed = options.control or Control(), options.resumed
     dry = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     if only_listens(session.controller):
-        raise ConfigError("Abbe can only read this control: it does not move it", "start an NC program there, and use `abbe listen`")
+        raise ConfigError("Abbe can only read this control, not move its axes", "start an NC program there, and use `abbe listen`")
     await check_devices(session, plan, air=site.watching.air_c is not None)
     if resumed is not None:
         campaign = resumed.campaign

@@ -115,10 +115,9 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
 
 
 BOUND_NOTE = (
-    "U is the posterior (Bayesian Cramer-Rao) bound for these readings over the inner 80 % of the volume, without rigid motion, with the "
-    "temperature of the scales; it leaves out error motions above the plan's order, and the uncertainty of the estimated noise and typical "
-    "sizes; "
-    "`abbe solve` includes both, so its U may be larger; on a machine better than the priors its U is smaller"
+    "U is the smallest that these readings allow (Bayesian Cramer-Rao bound), over the inner 80 % of the volume, rigid motion removed, "
+    "temperature of the scales included. `abbe solve` may state a larger U: it also includes error motions of higher orders, and the "
+    "uncertainty of the estimated noise and typical sizes. On a machine better than a typical one, its U is smaller"
 )
 
 

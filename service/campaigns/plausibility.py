@@ -131,7 +131,7 @@ async def _laser(session: Session, needed: Needed) -> None:
     name = getattr(laser, "name", LASER)
     while (reading := await laser.peek()).sample_count == first.sample_count:
         if clock() > until_s:
-            raise ReplyTimeout(name, "read", f"no new sample within {LASER_S:g} s", "is the meter measuring?")
+            raise ReplyTimeout(name, "read", f"no new sample within {LASER_S:g} s", "start the meter's measurement")
         await asyncio.sleep(POLL_S)
     check_sensors(name, reading)
 
@@ -144,15 +144,15 @@ def check_sensors(name: str, reading: LaserReading) -> None:
     ):
         if not (low <= value <= high or math.isnan(value)):
             detail = f"its {what} reads {value:g} {unit}, which no workshop has"
-            raise WrongDevice(name, "read", detail, "is the sensor connected? is this the laser?")
+            raise WrongDevice(name, "read", detail, "connect the sensor, and check that the address is the laser's")
 
 
 async def _fixture(session: Session, needed: Needed) -> None:
     fixture = session.need_fixture()
     if isinstance(fixture, ConsoleFixture) and not session.attended:
         raise ConfigError(
-            "a person at the console mounts bar and mirror, and the console is unattended",
-            "run it from a terminal, or configure a remote fixture; nothing has moved",
+            "a person at the console has to mount bar and mirror, but nobody is at the console",
+            "start the command from a terminal, or configure a remote fixture; nothing has moved",
         )
     await fixture.identify()
 

@@ -157,18 +157,18 @@ class _Finder:
         hand = [one for one in self._lines.hand if (one.setup, one.mounting) == (setup, number)]
         why = ""
         if hand[-1].phase != "done":
-            why = "its mounting was not confirmed as done"
+            why = "nobody confirmed that it was mounted"
         elif hand[-1].what == "Unmount":
-            why = "it was cleared away"
+            why = "it was taken away"
         else:
             item = await self._in_place(session, item, number, hand[-1])
             if (setup, number) in self.used and not item.resume_trail.carried:
-                question = f"Set-up {setup} was left mounted and has complete runs. Is it still untouched?"
-                why = "" if await confirm(question) else "it is not confirmed as untouched, and has complete runs"
+                question = f"Set-up {setup} was left mounted and has complete runs. Is the set-up still untouched?"
+                why = "" if await confirm(question) else "it has complete runs, and nobody confirmed that it is untouched"
             elif item.remainder is not None and not await confirm(halfway(item)):
                 item = resumed_item(item, item.hand, ())
         if why:
-            messages.append(f"set-up {setup} is mounted anew for {item.test.label}: {why}")
+            messages.append(f"set-up {setup} must be mounted again for {item.test.label}: {why}")
             self.mountings[setup] = number + 1
             return mounted_anew(item, number + 1)
         kept = len(item.resume_trail.carried)

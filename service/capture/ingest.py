@@ -118,7 +118,7 @@ class Ingest:
                 again = True
                 continue
             except Exception as error:  # noqa: BLE001 - a silent end of the thread would look like a slow database
-                self._fail(CaptureFault(f"the transfer to the database failed: {error!r}", "report this"))
+                self._fail(CaptureFault(f"the transfer to the database failed: {error!r}", "report this as a defect of Abbe"))
                 return
             with self._news:
                 for _ in batch:

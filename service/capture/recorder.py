@@ -123,7 +123,7 @@ class CaptureLog:
             except AbbeError as error:
                 self.error = self.error or error
             except Exception as error:  # noqa: BLE001 - the run did not end in order and must not look so
-                self.error = self.error or CaptureFault(f"the capture could not be ended: {error!r}", "report this")
+                self.error = self.error or CaptureFault(f"the capture could not be ended: {error!r}", "report this as a defect of Abbe")
 
     @property
     def hangs(self) -> bool:
@@ -175,7 +175,7 @@ class CaptureLog:
             except AbbeError as error:
                 self.error = error
             except Exception as error:  # noqa: BLE001 - a silent end of the thread would block the tap for ever
-                self.error = CaptureFault(f"the capture failed: {error!r}", "report this")
+                self.error = CaptureFault(f"the capture failed: {error!r}", "report this as a defect of Abbe")
         self._drop(items)
 
     def _end_for_want_of_space(self) -> None:
@@ -411,7 +411,7 @@ async def recording(
     if recorder.behind:
         raise StoreError(
             f"the database did not take all samples within {CATCH_UP_S:g} s; they are safe in {recorder.log.segment.path}",
-            "check the database; the next `abbe` command that connects to the machine takes them over",
+            "check the database; the next `abbe` command that connects to the machine stores them there",
         )
 
 

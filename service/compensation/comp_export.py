@@ -41,7 +41,7 @@ from abbe.service.verification.reduction import UNKNOWN
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
 BEYOND = 0.1
 """An export warns if at least this share of a stroke lies beyond the positions of the runs."""
-ONLY_FRESH = "the tables assume that no table was active during the measurement: if one was, add it to them"
+ONLY_FRESH = "the tables assume that no table was active during the measurement: if one was, add its corrections to these tables"
 
 
 @dataclass(frozen=True)

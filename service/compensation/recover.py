@@ -232,12 +232,12 @@ async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
     """
     if await is_own(controller, site, journal):
         return
-    at = _address(journal) or "an address not noted"
+    at, name = _address(journal) or "an address that the journal does not state", _name(journal, site)
     raise TableMismatch(
-        f"push {journal[-1].push} of {_name(journal, site)!r} was begun at {at} and has not ended, and its table is not in force here",
-        f"start with the file of {_name(journal, site)!r}; if this is that machine and its table is right: "
-        "`abbe accept-table -m MACHINE.toml --yes`; "
-        "nothing was written",
+        f"push {journal[-1].push} of machine {name!r}, begun at {at}, has not ended, and "
+        f"nothing shows that this control is that of {name!r}",
+        f"finish the push with the machine file of {name!r}; if this control is that of {name!r} and its active table is right: "
+        "`abbe accept-table -m MACHINE.toml --yes`; nothing was written",
     )
 
 

@@ -59,7 +59,7 @@ def standstill_answer(campaign: str, runs: Sequence[Run]) -> StandstillAnswer:
     runs = sorted(runs, key=lambda r: float(r.columns.t_s[0]))
     sensors = tuple(name for name in _sensors(runs[0]) if all(name in _sensors(r) for r in runs))
     if not sensors:
-        raise NotObservable("the runs have no temperature in common", "give every run the same sensors")
+        raise NotObservable("the runs have no temperature column in common", "export every run with the same columns temp_..._C")
     series = [_series(r, sensors) for r in runs]
     fitted = [k for k, r in enumerate(runs) if r.identifies]
     try:
@@ -86,7 +86,9 @@ def _series(run: Run, sensors: Sequence[str]) -> StandstillRun:
     reading = np.zeros(len(columns)) if run.is_sealed else columns.readings_mm
     kept = columns.valid & np.isfinite(temperatures).all(axis=1) & np.isfinite(reading) & np.isfinite(columns.t_s)
     if kept.sum() < 2:
-        raise NotObservable(f"run {run.run_id}: {kept.sum()} readings with all temperatures", "leave it out (--without)")
+        raise NotObservable(
+            f"run {run.run_id}: only {kept.sum()} readings have all temperatures, expected 2 or more", "leave it out (--without)"
+        )
     return StandstillRun(run.run_id, columns.t_s[kept], reading[kept] - reading[kept][0], temperatures[kept])
 
 

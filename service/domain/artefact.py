@@ -26,9 +26,22 @@ def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, P
     return matrix
 
 
-def touched_name(feature: str, *, qualifies: bool) -> str:
-    """Name what is touched, for people: a feature, or the qualification sphere."""
-    return f"{'qualification sphere' if qualifies else 'feature'} {feature}"
+class Touched:
+    """Name of a feature of the artefact, or of the qualification sphere (``u_sphere_mm`` is not None), that is or was touched."""
+
+    __slots__ = ()
+    feature: str
+    u_sphere_mm: float | None
+
+    @property
+    def qualifies(self) -> bool:
+        """Whether this is the qualification sphere."""
+        return self.u_sphere_mm is not None
+
+    @property
+    def what(self) -> str:
+        """Its name, for people."""
+        return f"{'qualification sphere' if self.qualifies else 'feature'} {self.feature}"
 
 
 class PoseObject(FileObject):

@@ -77,7 +77,7 @@ def record(kind: type[T], doc: object, what: str) -> T:
     try:
         return parsed(kind, doc)
     except ValueError as error:
-        raise Unusable(f"{what} has another form than expected: {error}", "make it again with this version") from None
+        raise Unusable(f"{what} does not have the expected content: {error}", "make it again with this version of Abbe") from None
 
 
 def parsed(kind: type[T], doc: object) -> T:

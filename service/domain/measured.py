@@ -14,7 +14,7 @@ from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Self, TypeVar
 
-from abbe.service.domain.artefact import touched_name
+from abbe.service.domain.artefact import Touched
 from abbe.service.domain.document import Doc, DocumentRow, HistoryRow, record
 from abbe.service.errors import StoreError
 
@@ -122,7 +122,7 @@ class BarRecord(StandstillRecord):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class TouchedFeature:
+class TouchedFeature(Touched):
     """The touches of a hole (``inside``) or ball.
 
     ``nominal_mm``: nominal place in artefact axes; ``target_mm``: axis position expected for its centre; ``sides``: unit vectors from
@@ -144,16 +144,6 @@ class TouchedFeature:
     resolution_mm: float = 0.0
     radius_mm: float | None = None
     u_sphere_mm: float | None = None
-
-    @property
-    def qualifies(self) -> bool:
-        """Whether these are touches of the qualification sphere."""
-        return self.u_sphere_mm is not None
-
-    @property
-    def what(self) -> str:
-        """Name of what was touched, for people."""
-        return touched_name(self.feature, qualifies=self.qualifies)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

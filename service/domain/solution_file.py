@@ -334,4 +334,6 @@ def stored_solution(doc: object, number: int) -> SolutionFile:
     try:
         return SolutionFile.read(doc)
     except ValidationError:
-        raise Unusable(f"solution {number} was stored in another form than abbe-solution/1", "solve the campaign again") from None
+        raise Unusable(
+            f"solution {number} is not in the format abbe-solution/1: another version of Abbe stored it", "solve the campaign again"
+        ) from None

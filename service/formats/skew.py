@@ -75,7 +75,10 @@ def write(comp: Compensation, settings: FormatSettings, *, dialect: SkewProgram)
     lost = {a: comp.lost_motion_mm.get(a, 0.0) for a in AXES}
     negative = next((a for a, v in lost.items() if v < 0.0), None)
     if negative is not None:
-        raise FormatRefused(f"{dialect.what}: the lost motion of {negative} is negative, {lost[negative] * 1e3:.2f} µm", NOTHING)
+        raise FormatRefused(
+            f"{dialect.what}: the lost motion of {negative} is {lost[negative] * 1e3:.2f} µm, expected 0 or more",
+            f"measure the reversals of {negative} again; {NOTHING}",
+        )
     lines = _COMMANDS[dialect.what](factors, {a: fixed(v, settings.decimals) for a, v in lost.items()})
     return (TextFile(dialect.name, "\n".join(lines) + "\n"),)
 
@@ -155,10 +158,10 @@ def _read_marlin(file: TextFile, line: int, text: str, found: dict[str, float]) 
         raise file.wrong(line, f"{code} is neither M852, M425 nor M500")
     for word in words:
         if word[0] not in names[code]:
-            raise file.wrong(line, f"{word} is no word of {code}")
+            raise file.wrong(line, f"{code} has no parameter {word}")
         found[names[code][word[0]]] = file.number(line, word[1:], word[0])
     if found.get("share", 1.0) != 1.0:
-        raise file.wrong(line, f"F{found['share']:g} corrects a part of the lost motion only")
+        raise file.wrong(line, f"F{found['share']:g} corrects only a part of the lost motion, expected F1")
 
 
 def _read_klipper(file: TextFile, line: int, text: str, found: dict[str, float]) -> None:
@@ -175,7 +178,7 @@ def _read_klipper(file: TextFile, line: int, text: str, found: dict[str, float])
         try:
             found[plane.lower()] = factor_of(*values)
         except (ValueError, ZeroDivisionError):
-            raise file.wrong(line, f"{word}: no figure has these lengths") from None
+            raise file.wrong(line, f"{word}: no parallelogram has these lengths") from None
 
 
 def _read_grblhal(file: TextFile, line: int, text: str, found: dict[str, float]) -> None:

@@ -261,7 +261,7 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
     if hard:
         name, times = hard[0]
         raise InstrumentsDisagree(
-            f"the error of {name.replace('_', ' ')} would have to be {times:.0f} times its prior standard uncertainty",
+            f"the error of {name.replace('_', ' ')} would have to be {times:.0f} times the standard uncertainty that Abbe assumes for it",
             "check the laser's air compensation, the bar's length, the cup and the mirror before measuring again; nothing was written",
         )
     return [_unusual(name, times, data) for name, times in found]

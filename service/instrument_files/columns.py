@@ -255,7 +255,7 @@ class _ReadingRows:
         k, words = self.index(one.column), list[str]()
         for row, (_, cells) in enumerate(self.rows):
             if len(cells) <= k:
-                raise self.wrong(row, f"{len(cells)} cells, {what} is in column {k + 1}")
+                raise self.wrong(row, f"only {len(cells)} cells, but {what} is in column {k + 1}")
             words.append(self._plain(row, cells[k].strip()))
         values = [self.table.file.number(line, word, what) for (line, _), word in zip(self.rows, words, strict=True)]
         return np.array(values), words

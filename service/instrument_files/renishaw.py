@@ -279,7 +279,7 @@ def _environment(parts: _Sections, axis: str, n: int) -> tuple[dict[str, F1], di
         values = [parts.file.number(line, word, key) for word in rest.split()]
         low, high, unit = taken
         if not 1 <= len(values) <= 3:
-            raise parts.file.wrong(line, f"{len(values)} values of {key}, expected those at the start, in the middle and at the end")
+            raise parts.file.wrong(line, f"{key} has {len(values)} values, expected 1 to 3 (start, middle, end)")
         if not all(low <= v <= high for v in values) or not any(values):
             notes.append(f"{key} (line {line}) is zero, or not from {low:g} to {high:g}: it was not used")
         elif key.lower().startswith("mat"):

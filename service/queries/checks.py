@@ -47,7 +47,7 @@ def check(reader: Reader, number: int) -> Verification:
     row = reader.row("verifications", number, "check")
     found = _check(row)
     if found is None:
-        raise Unusable(f"check {number} was stored in another form")
+        raise Unusable(f"check {number} is in the format of another version of Abbe", "open it with the version that stored it")
     return found
 
 

@@ -108,7 +108,9 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
     row = reader.row("solutions", number, "solution")
     document = read_as(SolutionFile, row.doc)
     if document is None:
-        raise Unusable(f"solution {number} was stored in another form than abbe-solution/1", "solve the campaign again")
+        raise Unusable(
+            f"solution {number} is not in the format abbe-solution/1: another version of Abbe stored it", "solve the campaign again"
+        )
     return of_row(SolutionDetail, row, document=document)
 
 

@@ -32,6 +32,7 @@ factor of that uncertainty."""
 TOUCH_S = 30.0
 RESEAT_S, POLL_S = 1.0, 0.02
 """How long a stylus may take to come back to rest after a touch (receivers report it late), and the interval of looks at it."""
+_ANEW = "the points so far are kept as evidence, and Abbe measures the pose again from its start"
 SAME_PLACE_MM = 1e-5
 
 
@@ -245,12 +246,16 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
         raise SetupDisturbed(
             f"{touched.what}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um while {len(earlier)} features "
             "were touched: the stylus is no longer as it was qualified",
-            "its points so far are kept as evidence; tighten or change the stylus, qualify it, and the pose is measured from the beginning",
+            f"tighten or change the stylus and qualify it; {_ANEW}",
         )
     moved = math.dist(now.centre_mm, then.centre_mm)
     if moved > MOVED_MM:
-        why = "the stylus was changed or knocked, or the sphere is loose" if touched.qualifies else "the artefact is loose"
+        why, remedy = (
+            ("the stylus was changed or knocked, or the sphere is loose", "fasten stylus and sphere, and qualify the stylus")
+            if touched.qualifies
+            else ("the artefact is loose", "clamp the artefact firmly")
+        )
         raise SetupDisturbed(
             f"{touched.what} moved by {1e3 * moved:.0f} um while {len(earlier)} features were touched: {why}",
-            "its points so far are kept as evidence; it is clamped anew and measured from the beginning",
+            f"{remedy}; {_ANEW}",
         )

@@ -180,7 +180,9 @@ class StretchComparison:
     def from_box(self, boot_id: int) -> None:
         """Raise RunInterrupted if the box was restarted: its earlier readings must not be joined to new ones."""
         if boot_id != self._on.boot_id:
-            raise RunInterrupted("the ball-bar's box was restarted since the path was interrupted", "the path begins again")
+            raise RunInterrupted(
+                "the ball-bar's box was restarted since the path was interrupted", "Abbe measures the path again from its start"
+            )
 
     def add(self, sample: BarSample) -> None:
         """Add the next sample. Raises StretchDiffers if the stretch reads otherwise, or could not be read."""
@@ -189,7 +191,9 @@ class StretchComparison:
             return
         if self._first_us is None:
             if before is None or (before.seq + 1) % 2**32 != sample.seq:
-                raise StretchDiffers("the first samples of the path were lost", "look at the ball-bar's cable; the path begins again")
+                raise StretchDiffers(
+                    "the first samples of the path were lost", "check the ball-bar's cable; Abbe measures the path again from its start"
+                )
             self._first_us = sample.device_us
         at_mm = ((sample.device_us - self._first_us) * 1e-6 + self._half_s) * self._on.feed_mm_s
         if at_mm > self._on.arc_mm[-1]:
@@ -210,7 +214,7 @@ class StretchComparison:
         if len(self._off) < LEAST_READINGS:
             raise StretchDiffers(
                 "too few valid readings when the path's last stretch was measured again",
-                "check the ball-bar and its box; the path begins again",
+                "check the ball-bar and its box; Abbe measures the path again from its start",
             )
         off = np.array(self._off)
         noise_mm = 1.4826 * float(np.median(np.abs(off - np.median(off)))) / np.sqrt(off.size)
@@ -218,8 +222,9 @@ class StretchComparison:
         if abs(self.off_mm) > self._allowed_mm + 3.0 * noise_mm:
             raise StretchDiffers(
                 f"the path's last stretch reads {1e3 * abs(self.off_mm):.1f} um off its value before the interruption "
-                f"(allowed: {1e3 * self._allowed_mm:.1f})",
-                "cup or bar was displaced, or the machine has drifted: the path starts again, or the bar is mounted again",
+                f"(allowed: {1e3 * self._allowed_mm:.1f} um)",
+                "cup or bar was displaced, or the machine has drifted; Abbe measures the path again from its start, "
+                "or asks a person to mount the bar again",
             )
 
 
@@ -366,8 +371,8 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
     segment, off_mm = _nearest(trail, here, resume_trail.to, latest=resume_trail.latest)
     if off_mm > OFF_PATH_MM:
         raise SetupDisturbed(
-            f"the machine stands {off_mm:.3f} mm off the path of the test",
-            "it was moved during the break: the set-up is mounted anew",
+            f"the machine stands {off_mm:.3f} mm off the path of the test: somebody moved it during the break",
+            "mount the set-up again when Abbe asks for it",
         )
     if len(trail) == 1:
         return ()
@@ -384,7 +389,7 @@ def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
     k = next((k for k, step in enumerate(first.steps) if isinstance(step, MountBar | MountLaser)), None)
     if k is None:
         raise SetupDisturbed(
-            f"another campaign mounted the set-up of test {test.label}, and this one cannot mount it anew",
+            f"another campaign mounted the set-up of test {test.label}, and this campaign cannot mount it again",
             "remove the instrument and start a new campaign",
         )
     opening: tuple[Step, ...] = (Unmount(), *(s for s in first.steps[: k + 1] if not isinstance(s, Unmount)))

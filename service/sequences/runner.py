@@ -182,10 +182,10 @@ class Runner:
         watch.tolerated, self._still, self._paused_here = NOTHING, False, True
         if touched and self._stands:
             self.touched = True
-            raise RunInterrupted("the door was open during the pause", "the set-up is checked again before the test resumes")
+            raise RunInterrupted("the door was open during the pause", "Abbe asks about the set-up before it resumes the test")
         status = await self._s.controller.status()
         if math.dist(status.position_mm, before_mm) > SAME_PLACE_MM:
-            raise RunInterrupted("the axes were moved during the pause", "the test resumes from its last checkpoint")
+            raise RunInterrupted("the axes were moved during the pause", "Abbe resumes the test from its last checkpoint")
 
     async def _spared(self) -> bool:
         """Return whether nothing of ours can move and another program controls the machine: a stop would end that program."""
@@ -262,8 +262,8 @@ class Runner:
         off_mm = abs(now.displacement_tenth_nm - before.displacement_tenth_nm) * MM_PER_COUNT
         if off_mm > REFERENCE_MM:
             raise SetupDisturbed(
-                f"the last point reads {1e3 * off_mm:.1f} um off its value before the interruption (allowed: {1e3 * REFERENCE_MM:.0f})",
-                "laser or mirror was displaced: the set-up is mounted anew",
+                f"the last point reads {1e3 * off_mm:.1f} um off its value before the interruption (allowed: {1e3 * REFERENCE_MM:.0f} um)",
+                "laser or mirror was displaced; mount the set-up again when Abbe asks for it",
             )
         for one in carried:
             await recorder.add_record(one)

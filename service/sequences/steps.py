@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from abbe.service.domain.artefact import touched_name
+from abbe.service.domain.artefact import Touched
 from abbe.service.domain.run import AnySetup, BarSetup
 
 Point = tuple[float, float, float]
@@ -108,7 +108,7 @@ class MountArtefact:
 
 
 @dataclass(frozen=True, slots=True)
-class TouchFeature:
+class TouchFeature(Touched):
     """Touch a hole or ball from all sides; begins and ends above it, where the stylus is clear of everything.
 
     ``centre_mm``: expected axis position with the tip in its centre (hole: at the depth of the touches); ``radius_mm``: expected
@@ -132,16 +132,6 @@ class TouchFeature:
     touch_feed_mm_min: float
     start_deg: float
     u_sphere_mm: float | None = None
-
-    @property
-    def qualifies(self) -> bool:
-        """Whether this is the qualification sphere."""
-        return self.u_sphere_mm is not None
-
-    @property
-    def what(self) -> str:
-        """Name of what is touched, for people."""
-        return touched_name(self.feature, qualifies=self.qualifies)
 
     @property
     def above_mm(self) -> Point:

@@ -105,7 +105,8 @@ def pose_figures(runs: list[Run], known: JointSolution, room_c: tuple[float, flo
         check_judged(run)
         if not isinstance(run.setup, ArtefactSetup) or f"form_{run.setup.artefact}_" not in " ".join(known.estimate.names):
             raise MeasurementFault(
-                f"the solution does not contain the artefact of run {run.run_id}", "measure the same artefact in another pose"
+                f"run {run.run_id} is not of an artefact that the solution contains",
+                "verify with the artefact of the identification, in a pose that the identification did not use",
             )
         data = run_data(run)
         if any(same_pose(data, used) for used in known.data):
@@ -181,14 +182,14 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
     """
     why = incomparable(before, after, pushed_crc)
     if why:
-        return VerificationDecision(False, f"cannot tell whether it is better: {why}")
+        return VerificationDecision(False, f"cannot tell whether the machine is better: {why}")
     worst = before.worst.value_mm
     gain, needed = worst - after.worst.value_mm, _expanded(before.worst, after.worst)
     change = f"worst {before.of} {worst * 1e3:.1f} → {after.worst.value_mm * 1e3:.1f} µm"
     if gain <= needed:
         return VerificationDecision(False, f"{change}: no improvement beyond its uncertainty of {needed * 1e3:.1f} µm")
     if (before.helix is None) != (after.helix is None):
-        return VerificationDecision(False, f"{change}, but the helix was measured only once: the rest cannot be judged")
+        return VerificationDecision(False, f"{change}, but only one of the two verifications has a helix: the helix cannot be compared")
     if before.diagonals.keys() != after.diagonals.keys():
         return VerificationDecision(False, f"{change}, but the two verifications do not have the same runs")
     kind = before.of.removeprefix("body ")
@@ -198,7 +199,7 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
     for name, old, new, scale in pairs:
         if _expanded(old, new) > gain:
             blind = f"the {name} is uncertain by {_expanded(old, new) * 1e3:.1f} µm, more than the {gain * 1e3:.1f} µm that were gained"
-            return VerificationDecision(False, f"{change}, but cannot tell whether nothing got worse: {blind}")
+            return VerificationDecision(False, f"{change}, but cannot tell whether something got worse: {blind}")
         worse = new.value_mm - old.value_mm
         if worse > _expanded(old, new) + WORSE_SHARE * scale:
             return VerificationDecision(

@@ -80,7 +80,7 @@ GOOD = {"CANARY_I32": 0x01020304, "CANARY_F32": 0x449A5000, "MAP_VER": 1}
     [
         ({"CANARY_I32": 0x03040102}, "two registers of a value are swapped"),
         ({"CANARY_I32": 0x02010403}, "bytes inside a register are swapped"),
-        ({"CANARY_I32": 0}, "really belong to this device"),
+        ({"CANARY_I32": 0}, "may belong to another device"),
         ({"CANARY_F32": 0x5000449A}, "5000449a"),
         ({"MAP_VER": 2}, "version 2 instead of 1"),
     ],

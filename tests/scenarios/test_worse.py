@@ -65,15 +65,15 @@ WAYS = {
     "uncertainties too large": (lambda s: Push(s, *s.here, s.tables(), alter=scattered), "beyond its uncertainty"),
     "the helix measured only once": (
         lambda s: Push(s, *s.here, s.tables(), plan=plan_of(s.site, "", helix=False)),
-        "the helix was measured only once",
+        "only one of the two verifications has a helix",
     ),
     "measured with another table": (
         lambda s: Push(s, *s.here, s.tables(), alter=of_the_old_table),
-        "cannot tell whether it is better: it was measured with table 0000002A",
+        "cannot tell whether the machine is better: it was measured with table 0000002A",
     ),
     "warmer between before and after": (
         lambda s: Push(s, *s.here, s.tables(), lambda: s.sims.ask("air", plus_c=3.0)),
-        "cannot tell whether it is better: the air was at",
+        "cannot tell whether the machine is better: the air was at",
     ),
 }
 """Ways in which the verification says no: what is pushed and what happens, and what stands in the journal."""

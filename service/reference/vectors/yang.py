@@ -79,7 +79,7 @@ def read_volumetric(case: VectorCase, checks: Checks) -> None:
         first = part.at("delta_eq1")
         checks.compare("delta, eq (1) as printed", delta_eq1(errors, slide, tool)[0], first, unit="mm", floor=1e-16, relative=1e-14)
         by_chain = deviation_mm(form, workpiece_mm(slide), iso_motions(errors, slide))[0]
-        checks.compare("delta, rule G", by_chain, first, unit="mm", floor=1e-16, relative=1e-14)
+        checks.compare("delta, by the kinematic chain", by_chain, first, unit="mm", floor=1e-16, relative=1e-14)
         exact = delta_exact(errors, slide, tool)[0]
         checks.compare("delta, full rotations", exact, part.at("delta_exact_rot"), unit="mm", floor=3e-13, rounding=SUBTRACTED)
         matrix = delta_exact(errors, slide, tool, small_angles=True)[0]

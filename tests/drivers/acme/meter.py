@@ -95,7 +95,7 @@ class AcmeMeter:
                 raise ReplyTimeout(self.name, "read", f"reading {after_count} is repeated for {NEW_S:g} s")
             await asyncio.sleep(0.01)
         if reading.status & LaserFlag.BEAM_LOST or self._zero_um is None:
-            raise DeviceFault(self.name, "read", "no target, or not zeroed since", "zero it, then repeat this test")
+            raise DeviceFault(self.name, "read", "no target, or not zeroed since", "zero the meter, then repeat this test")
         return reading
 
     async def close(self) -> None:

@@ -257,7 +257,7 @@ async def test_the_port_is_exclusive(bar_peer, bar):
 
 
 async def test_missing_port():
-    with pytest.raises(LinkDown, match="plugged in"):
+    with pytest.raises(LinkDown, match="plug the adapter in"):
         await open_ballbar("serial:///dev/no-such-port")
 
 
@@ -286,7 +286,7 @@ async def test_socket_refused():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
         port = free.getsockname()[1]
-    with pytest.raises(LinkDown, match="address and port right"):
+    with pytest.raises(LinkDown, match="check address and port"):
         await open_ballbar(f"socket://127.0.0.1:{port}")
 
 

@@ -149,7 +149,7 @@ async def test_reboot_during_a_move(controller, cnc):
 
 async def test_a_move_that_takes_too_long_is_held(controller, cnc):
     cnc.auto_finish = False
-    with pytest.raises(ReplyTimeout, match="feed hold set"):
+    with pytest.raises(ReplyTimeout, match="Abbe set feed hold"):
         await controller.move(TARGET, feed_mm_min=1.0, timeout_s=0.1)
     assert cnc.log == [("motion", 1), ("hold", 1)]
 

@@ -133,7 +133,7 @@ async def test_registry(peer):
 
 async def test_nobody_there(peer):
     peer.server.close()
-    with pytest.raises(LinkDown, match="fixture running"):
+    with pytest.raises(LinkDown, match="fixture is running"):
         await open_fixture(peer.url, None)
 
 

@@ -30,7 +30,7 @@ async def test_hang_up_during_a_write_is_link_down_at_once(peer, link):
         assert await link.read(400, 1) == (400,)
         assert link.connections == 2
     else:
-        with pytest.raises(LinkDown, match="plugged in"):
+        with pytest.raises(LinkDown, match="plug the adapter in"):
             await link.read(100, 1)
 
 
@@ -50,7 +50,7 @@ async def test_nobody_there(tcp_peer):
     with pytest.raises(LinkDown) as caught:
         await ModbusLink.connect(parse_url(tcp_peer.url))
     assert caught.value.remedy
-    with pytest.raises(LinkDown, match="plugged in"):
+    with pytest.raises(LinkDown, match="plug the adapter in"):
         await ModbusLink.connect(parse_url("modbus+rtu:///dev/no-such-port"))
 
 
@@ -90,7 +90,7 @@ async def test_a_cancellation_that_meets_the_reply_is_never_lost(tcp_peer):
 
 async def test_a_port_in_use_is_refused(rtu_peer):
     first = await ModbusLink.connect(parse_url(rtu_peer.url))
-    with pytest.raises(LinkDown, match="another program"):
+    with pytest.raises(LinkDown, match="close the other program"):
         await ModbusLink.connect(parse_url(rtu_peer.url))
     await first.close()
 

@@ -209,7 +209,7 @@ def test_a_step_beside_a_name_is_not_credited_to_the_name() -> None:
     assert evidence[0] < found.effects[0].evidence
     told = dict(found.rejected)
     for label, value in found.beside:
-        assert told[label].startswith(f"{value:.0f} nats, without a name: ")
+        assert told[label].startswith(f"evidence {value:.0f}, without a name: ")
     assert answered(found, case)["beside"] == [{"label": label, "evidence": value} for label, value in found.beside]
 
 
@@ -218,7 +218,7 @@ def test_nothing_stands_beside_a_lone_name_or_an_unknown() -> None:
     unknown = discover(campaign(backlash_um=0.8, step_um=6.0), CATALOGUE)
     assert unknown.verdict == "unknown"
     assert unknown.effects == unknown.beside == ()
-    assert "less than the structures without a name" in dict(unknown.rejected)["backlash:X"]
+    assert "less than that of the structures without a name" in dict(unknown.rejected)["backlash:X"]
 
 
 def test_a_role_whose_readings_are_all_flagged_has_no_gap() -> None:

@@ -39,7 +39,7 @@ def test_scatter_of_repeated_solutions_is_the_stated_covariance():
 
 def test_a_combination_that_nothing_knows_is_named():
     a = np.ones((9, 2))
-    with pytest.raises(ValueError, match=r"no prior and no data for a combination with [ab]"):
+    with pytest.raises(ValueError, match=r"neither observations nor a prior determine [ab]"):
         solve_map(("a", "b"), a, np.zeros(9), np.ones(9), np.full(2, np.inf))
     assert solve_map(("a", "b"), a, np.ones(9), np.ones(9), np.array([1.0, np.inf])).value("a") == pytest.approx(0.0, abs=1e-9)
 

@@ -186,12 +186,12 @@ def test_a_backup_is_read_only_as_it_was_written(shop: Shop, tmp_path: Path) -> 
     for name in json.loads((target / "backup.json").read_text())["files"]:
         good = (target / name).read_bytes()
         (target / name).write_bytes(good[:-1] + bytes([good[-1] ^ 1]))
-        with pytest.raises(BackupRefused, match=f"{name} is not as it was written"):
+        with pytest.raises(BackupRefused, match=f"{name} is changed since the backup"):
             read_backup(target)
         os.unlink(target / name)
         with pytest.raises(BackupRefused, match=f"{name} is missing"):
             read_backup(target)
         (target / name).write_bytes(good)
     (target / "more").write_text("")
-    with pytest.raises(BackupRefused, match="more is not of this backup"):
+    with pytest.raises(BackupRefused, match="more is not part of this backup"):
         read_backup(target)

@@ -118,7 +118,7 @@ def test_a_damaged_file_is_named_and_nothing_restored(made: Path, elsewhere: Pat
     data[len(data) // 2] ^= 1
     (made / name).write_bytes(data)
     assert run(["restore", "-m", str(elsewhere), str(made)]) == 2
-    assert f"{name} is not as it was written" in capsys.readouterr().err
+    assert f"{name} is changed since the backup" in capsys.readouterr().err
     assert [path.name for path in elsewhere.parent.iterdir()] == ["machine.toml"]
 
 
@@ -238,5 +238,5 @@ def test_what_no_backup_holds_is_not_followed(
         path.symlink_to("/dev/zero" if odd == "link to a device" else "/etc")
     assert run(["restore", "-m", str(elsewhere), str(made)]) == 2
     said = capsys.readouterr().err
-    assert "it is a pipe" in said if odd == "list" else f"{path} is not of this backup" in said
+    assert "it is a pipe" in said if odd == "list" else f"{path} is not part of this backup" in said
     assert not (elsewhere.parent / "abbe.sqlite3").exists()

@@ -110,8 +110,8 @@ def test_a_wrong_piece_is_named_in_one_line(grown: Path, how: str, capsys: pytes
     capsys.readouterr()
     assert run(["restore", str(backup), "--db", url(grown / "new")]) == 2
     said = capsys.readouterr().err
-    told = {"damaged": "is not as it was written", "missing": "is missing", "additional": "is not of this backup"}
-    assert f"{piece} {told.get(how, 'is not as it was written')}" in said
+    told = {"damaged": "is changed since the backup", "missing": "is missing", "additional": "is not part of this backup"}
+    assert f"{piece} {told.get(how, 'is changed since the backup')}" in said
     assert said.count("\n") == 1
     assert list((grown / "new").iterdir()) == []
 
@@ -154,7 +154,7 @@ def test_a_list_of_another_size_is_refused_in_one_line(grown: Path, which: str, 
     assert run(["restore", str(path.parent), "--db", url(grown / "new")]) == 2
     said = capsys.readouterr().err
     assert f"the pieces in {path.parent / PIECES} have " in said
-    assert f" bytes, and their list says {doc['pieces']['bytes']}" in said
+    assert f" bytes, but their list says {doc['pieces']['bytes']} bytes" in said
     assert said.count("\n") == 1
     assert list((grown / "new").iterdir()) == []
 

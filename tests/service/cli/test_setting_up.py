@@ -127,7 +127,7 @@ def test_the_doctor_says_what_to_do_about_a_device_that_is_not_there(folder: Pat
     rows = {line.split("\t")[0]: line.split("\t")[1:] for line in said.out.splitlines()}
     assert rows["cnc"][0] == rows["ballbar"][0] == "bad"
     assert rows["cnc"][1].startswith("DRV-002: modbus+tcp://127.0.0.1:9")
-    assert "address and port right?" in rows["cnc"][2]
+    assert "check address and port" in rows["cnc"][2]
     assert rows["laser"][0] == "look"
     assert "mill-7 is not ready" in said.err
     assert said.err.splitlines()[-1] == "next: abbe doctor"

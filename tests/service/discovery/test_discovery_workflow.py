@@ -466,5 +466,5 @@ def test_points_of_artefacts_are_not_searched(tmp_path: Path) -> None:
 
 
 def test_a_stored_document_of_another_form_is_refused_with_its_place() -> None:
-    with pytest.raises(Unusable, match=r"a finding has another form than expected: gaps\.holdout\.after_um"):
+    with pytest.raises(Unusable, match=r"a finding does not have the expected content: gaps\.holdout\.after_um"):
         record(Finding, {"verdict": "none", "gaps": {"holdout": {"before_um": 1.0, "floor_um": 1.0}}}, "a finding")

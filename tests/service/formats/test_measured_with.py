@@ -56,7 +56,7 @@ def test_a_file_that_says_that_a_table_corrected_is_refused_whatever_is_said(exp
 def test_a_file_that_says_that_nothing_corrected_needs_no_note(export: Export, tmp_path: Path) -> None:
     code, said = export(file(tmp_path, {"crc": 7, "acting": False}))
     assert code == 0
-    assert "add it to them" not in said
+    assert "add its corrections to these tables" not in said
 
 
 def test_where_nobody_knows_a_person_has_to_say_it(export: Export, tmp_path: Path) -> None:
@@ -68,7 +68,7 @@ def test_where_nobody_knows_a_person_has_to_say_it(export: Export, tmp_path: Pat
 
 def test_runs_that_name_no_table_get_the_note(export: Export, tmp_path: Path) -> None:
     code, said = export(file(tmp_path))
-    assert (code, "add it to them" in said) == (0, True)
+    assert (code, "add its corrections to these tables" in said) == (0, True)
 
 
 @pytest.mark.parametrize(

@@ -96,7 +96,7 @@ def test_every_one_of_a_thousand_tamperings_is_found() -> None:
 def test_kept_heads_that_were_forged_or_removed_are_found() -> None:
     records = chain(5)
     heads = [anchor_of(r, KEY) for r in records]
-    assert faults(records, [], KEY) == ["no heads are kept outside the database: removed records would not be noticed"]
+    assert faults(records, [], KEY) == ["no checksums are kept outside the database: nobody would notice removed records"]
     assert any("not sealed" in text for text in faults(records, [*heads, replace(heads[-1], id=4)], KEY))
     assert faults([], heads, KEY)
 

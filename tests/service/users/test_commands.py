@@ -128,7 +128,7 @@ def test_users_by_the_commands(folder: Path, monkeypatch: pytest.MonkeyPatch, ca
     (folder / "abbe.sqlite3.audit-head").write_text("")
     code, out = abbe("audit", "verify")
     assert code == 1
-    assert "no heads are kept" in out
+    assert "no checksums are kept" in out
 
 
 def test_how_a_command_ended() -> None:

@@ -80,7 +80,7 @@ def test_a_better_machine_is_kept_and_a_worse_one_is_not(solved_and_last):
 
 def test_an_artefact_of_another_campaign_is_refused(solved_and_last):
     solved, last = solved_and_last
-    with pytest.raises(MeasurementFault, match="does not contain the artefact"):
+    with pytest.raises(MeasurementFault, match="is not of an artefact that the solution contains"):
         pose_figures([replace(last, setup=replace(last.setup, artefact="B"))], solved.joint)
 
 
