@@ -73,10 +73,11 @@ def begun_source(store: Store, name: str) -> RecipeSource:
     return RecipeSource(**source)
 
 
-async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan, name: str, confirm: Confirm) -> Resumed:
+async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan, name: str, confirm: Confirm | None) -> Resumed:
     """Find out where a campaign resumes. Stops a motion that is still running; nothing else moves.
 
-    ``plan`` must be the original one. ``confirm`` asks whether a set-up with complete runs is untouched; if not, it is mounted anew.
+    ``plan`` must be the original one. ``confirm`` asks whether a set-up with complete runs is untouched; if not, it is mounted anew. None:
+    nobody is asked, and every set-up with a test that is left is mounted anew, after a prompt to clear away what is mounted.
 
     Raises
     ------
@@ -143,7 +144,7 @@ class _Finder:
                     raise PreconditionsChanged(f"the journal states no time for the mounting of set-up {setup}", "measure a new campaign")
                 self.mounted_us[setup if number == 1 else f"{setup}-{number}"] = one.ctrl_us
 
-    async def starts(self, session: Session, confirm: Confirm, messages: list[str]) -> dict[str, Item]:
+    async def starts(self, session: Session, confirm: Confirm | None, messages: list[str]) -> dict[str, Item]:
         """Return the first remaining test of every begun set-up."""
         start: dict[str, Item] = {}
         for setup in self.mountings:
@@ -152,7 +153,7 @@ class _Finder:
                 start[item.test.label] = await self._start(session, item, confirm, messages)
         return start
 
-    async def _start(self, session: Session, item: Item, confirm: Confirm, messages: list[str]) -> Item:
+    async def _start(self, session: Session, item: Item, confirm: Confirm | None, messages: list[str]) -> Item:
         setup, number = item.setup, self.mountings[item.setup]
         hand = [one for one in self._lines.hand if (one.setup, one.mounting) == (setup, number)]
         why = ""
@@ -160,6 +161,8 @@ class _Finder:
             why = "nobody confirmed that it was mounted"
         elif hand[-1].what == "Unmount":
             why = "it was taken away"
+        elif confirm is None:
+            why = "nobody was asked whether it is untouched"
         else:
             item = await self._in_place(session, item, number, hand[-1])
             if (setup, number) in self.used and not item.resume_trail.carried:

@@ -183,13 +183,15 @@ class WebRequest:
 class StartJob(WebRequest):
     """Start a declared recipe now. ``key``: a repeated key starts no second job; empty: every request starts a new job.
 
-    ``alarm``: number of the alarm whose cause a full campaign looks for; 0: no alarm.
+    ``alarm``: number of the alarm whose cause a full campaign looks for; 0: no alarm. ``resume``: interrupted full campaign whose complete
+    runs are kept; empty: a new campaign.
     """
 
     kind: Literal["start"] = "start"
     recipe: Word
     key: Word
     alarm: Number
+    resume: Word
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

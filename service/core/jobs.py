@@ -55,14 +55,14 @@ async def no_alarms(_: int) -> str:
 
 @dataclass(frozen=True, slots=True)
 class FullCampaigns:
-    """Full campaigns that a person may start: their names, and ``of(recipe, who, alarm)``, the job for a user (None: not a campaign).
+    """Full campaigns that a person may start: their names, and ``of(recipe, who, alarm, resume)``, the job for a user (None: no campaign).
 
     ``may``: whether a user may propose tables, by the current table of users: a full campaign ends with this user's proposal;
     ``against``: why the cause of an alarm cannot be searched, an empty text if it can.
     """
 
     names: tuple[str, ...] = ()
-    of: Callable[[str, str, int], Job[Any] | None] = lambda recipe, who, alarm: None
+    of: Callable[[str, str, int, str], Job[Any] | None] = lambda recipe, who, alarm, resume: None
     may: Callable[[str], Awaitable[bool]] = deny
     against: Callable[[int], Awaitable[str]] = no_alarms
 
@@ -235,10 +235,11 @@ class JobRegistry:
         refused = await self._refused(asked.who)
         if refused:
             return _answer(asked.request, "forbidden", refused)
-        campaign = self.full.of(asked.recipe, asked.who, asked.alarm)
+        campaign = self.full.of(asked.recipe, asked.who, asked.alarm, asked.resume)
         if campaign is not None and not await self.full.may(asked.who):
             return _answer(asked.request, "forbidden", f"{asked.who} may not propose tables here, and {asked.recipe} ends with a proposal")
         what = f"{asked.recipe} for alarm {asked.alarm}" if asked.alarm else asked.recipe
+        what += f", resumes {asked.resume}" if asked.resume else ""
         requested = JobRequest(asked.request, asked.who, asked.key, what)
         earlier = self.earlier_answer(requested)
         if earlier is not None:
@@ -247,6 +248,8 @@ class JobRegistry:
             return _answer(asked.request, "conflict", against)
         if campaign is not None:
             return self.begin(requested, campaign)
+        if asked.resume:
+            return _answer(asked.request, "conflict", f"{asked.recipe!r} cannot be resumed: only a full campaign can")
         if split_recipe_name(asked.recipe)[0] not in self._recipes:
             there = ", ".join((*self._recipes, *self.full.names))
             return _answer(asked.request, "unknown", f"there is no recipe {asked.recipe!r} here; there are: {there}")

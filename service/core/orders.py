@@ -53,7 +53,8 @@ BY_ITSELF = "this service pushes approved proposals by itself ([alarm] push), or
 class CampaignOrder:
     """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it.
 
-    ``cause``: the alarm whose cause the campaign looks for, and the function that writes the alarm's lines; None: no alarm.
+    ``cause``: the alarm whose cause the campaign looks for, and the function that writes the alarm's lines; None: no alarm. ``resume``:
+    the interrupted campaign that it completes; empty: a new one.
     """
 
     recipe: str
@@ -61,6 +62,7 @@ class CampaignOrder:
     progress: ProgressSink
     control: Control
     cause: tuple[Alarm, Note] | None = None
+    resume: str = ""
 
 
 MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
@@ -178,12 +180,12 @@ def full_campaigns(
         The alarms whose cause a campaign can look for.
     """
 
-    def of(recipe: str, who: str, alarm: int) -> _OrderJob | None:
+    def of(recipe: str, who: str, alarm: int, resume: str) -> _OrderJob | None:
         if not is_full(recipe, names):
             return None
 
         async def act(progress: ProgressSink, control: Control) -> JobOutcome:
-            order = CampaignOrder(recipe, person(who), progress, control)
+            order = CampaignOrder(recipe, person(who), progress, control, resume=resume)
             if not alarm or alarms is None:
                 return await measure(order)
 
@@ -192,7 +194,7 @@ def full_campaigns(
 
             return await alarms.ordered(alarm, order.by, look, order.progress, order.control)
 
-        target = f"{context.machine}, {recipe}" + (f", alarm {alarm}" if alarm else "")
+        target = f"{context.machine}, {recipe}" + (f", alarm {alarm}" if alarm else "") + (f", resumes {resume}" if resume else "")
         begun = AuditEvent(who=who, action=CAMPAIGN, target=target, outcome="begun", doc={})
         job = _OrderJob(CAMPAIGN, recipe, _AuditTrail(context.audit, begun), act)
         job.alarm = alarm or None

@@ -12,13 +12,14 @@ from dataclasses import replace
 from abbe.models.compensation.tables import Predicted
 from abbe.service.campaigns.measure import MeasureOptions, artefacts_of, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates, check_devices, needed_by
+from abbe.service.campaigns.resume import resume as resume_campaign
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.proposals import check_certificates
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
-from abbe.service.errors import TableMismatch, TableRefused
+from abbe.service.errors import PreconditionsChanged, TableMismatch, TableRefused
 from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, investigate, make_proposal, plan_for, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
@@ -29,7 +30,7 @@ from abbe.service.verification.alarm_states import Alarm, Note
 SOLVING = "the measurement is complete, and nothing moves while it is solved"
 
 
-async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str) -> JobOutcome:
+async def run_guided_campaign(context: InvestigationContext, source: RecipeSource, by: str, *, resumes: bool = False) -> JobOutcome:
     """Measure the plan as a campaign with the plan's name, solve it and propose tables.
 
     A person mounts the instruments, as ``context.control.prompts`` asks.
@@ -40,11 +41,15 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
         Source of the plan, stored for a resumption.
     by : str
         The proposer: where two people are required, another person has to approve.
+    resumes : bool
+        The campaign was interrupted: its complete runs are kept, and every set-up that is left is mounted anew.
 
     Raises
     ------
     Stopped, Aborted
         A person asked for it. Completed runs are kept; a note says how to resume.
+    PreconditionsChanged
+        The campaign cannot be resumed: plan, machine file, table or control is another than at its beginning; nothing was measured.
     TableMismatch
         The table in force is switched off or unreadable; nothing was measured.
     AbbeError, DriverError, OSError, ArithmeticError, ValueError
@@ -58,7 +63,7 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
         _check_not_ended(context)
     except REFUSALS as no:
         return JobOutcome("ended", f"no proposal: {no}")
-    await _measured(context, source)
+    await _measured(context, source, resumes=resumes)
     try:
         return await _proposed(context, by)
     except REFUSALS as no:
@@ -68,26 +73,37 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
         raise
 
 
-async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note) -> None:
-    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both."""
+async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note, *, resume: str = "") -> None:
+    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both.
+
+    ``resume``: the alarm's interrupted campaign, if its complete runs are kept.
+    """
 
     async def measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
         check_certificates(context.site)
         _check_not_ended(context)
-        led = replace(context, plan=plan_for(context, alarm))
+        begun_last = alarm.last(AlarmKind.BEGUN)
+        if resume and (begun_last is None or begun_last.facts.campaign != resume):
+            raise PreconditionsChanged(f"campaign {resume!r} is not the last one of alarm {alarm.number}", "start a new search")
+        led = replace(context, plan=replace(context.plan, name=resume) if resume else plan_for(context, alarm))
         name = led.plan.name
 
         async def begun() -> None:
-            await note(AlarmKind.BEGUN, AlarmFacts(text=f"measuring campaign {name!r}", campaign=name))
+            await note(AlarmKind.BEGUN, AlarmFacts(text=f"{'resuming' if resume else 'measuring'} campaign {name!r}", campaign=name))
 
-        ids = await _measured(led, source, begun)
+        ids = await _measured(led, source, begun, resumes=bool(resume))
         return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {name!r} is measured: {len(ids)} runs", campaign=name))
 
     await investigate(context, alarm, note, measured)
 
 
-async def _measured(context: InvestigationContext, source: RecipeSource, begins: Callable[[], Awaitable[None]] | None = None) -> list[int]:
-    """Measure the plan; return the numbers of its runs. ``begins`` is called before anything moves, once the devices are checked."""
+async def _measured(
+    context: InvestigationContext, source: RecipeSource, begins: Callable[[], Awaitable[None]] | None = None, *, resumes: bool = False
+) -> list[int]:
+    """Measure the plan, or what is left of it; return the numbers of its runs.
+
+    ``begins`` is called before anything moves, once the devices are checked.
+    """
     site, store, name = context.site, context.store, context.plan.name
     plan = paced(context.plan, site.max_feed_mm_min)
     prompted = _PromptedPerson(context.control)
@@ -98,18 +114,19 @@ async def _measured(context: InvestigationContext, source: RecipeSource, begins:
             await check_devices(session, plan, air=site.watching.air_c is not None)
             await context.control.gate()
             await _check_table_acts(session)
+            found = await resume_campaign(session, store, site, plan, name, None) if resumes else None
             if begins is not None:
                 await begins()
-            begun = await start_campaign(session, store, site, name, artefacts_of(plan))
+            begun = await start_campaign(session, store, site, name, artefacts_of(plan)) if found is None else found.campaign
+            options = replace(options, resumed=found)
             try:
                 return await measure(
                     session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
                 )
             except BaseException as error:
-                kept = f"completed runs of campaign {name!r} are kept"
-                resume = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
-                anew = "" if begins is None else "; a search that is started again begins with the first set-up"
-                error.add_note(f"{kept}{anew}; {resume}")
+                kept = f"completed runs of campaign {name!r} are kept; the screen of a new measurement resumes it"
+                typed = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
+                error.add_note(f"{kept}; {typed}")
                 raise
 
 
@@ -158,6 +175,7 @@ class _PromptedPerson:
         await self._control.unless_stopped(self._control.prompts.ask(text))
 
 
-def named_now(context: InvestigationContext, recipe: str) -> InvestigationContext:
-    """Return the context with a plan whose name consists of recipe, machine and present time."""
-    return replace(context, plan=replace(context.plan, name=f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"))
+def named_for(context: InvestigationContext, recipe: str, resume: str = "") -> InvestigationContext:
+    """Return the context with a plan of the interrupted campaign's name, or named after recipe, machine and present time."""
+    name = resume or f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
+    return replace(context, plan=replace(context.plan, name=name))

@@ -56,17 +56,18 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
         """Run a recipe now; ``identification``, the full campaign, ends with a proposal and also needs the permission ``propose``.
 
         With ``alarm`` the full campaign also looks for the cause of that alarm: it resumes after the last finished step or, if there is
-        an answer, starts anew.
+        an answer, starts anew. With ``resume`` it keeps the complete runs of an interrupted campaign.
         """
         visit: Visit = request.state.visit
         recipe = named(wanted.recipe, wanted.rate_hz)
         visit.target = f"recipe {recipe}" + (f", alarm {wanted.alarm}" if wanted.alarm else "")
+        visit.target += f", resumes {wanted.resume}" if wanted.resume else ""
         # The core knows the role of the user, but not the scopes of a token.
         if split_recipe_name(recipe)[0] in campaigns and Permission.PROPOSE not in visit.principal.permissions:
             return problem(
                 403, f"{recipe} ends with a proposal: it needs {Permission.PROPOSE.value!r} as well as {Permission.MEASURE.value!r}"
             )
-        answer = await core.start(recipe, key, visit.principal.name, wanted.alarm)
+        answer = await core.start(recipe, key, visit.principal.name, wanted.alarm, wanted.resume)
         if answer.outcome == "unknown":
             return problem(422, answer.text)
         visit.target = f"job {answer.job}, {visit.target}" if answer.job else visit.target

@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.bounds import WORD
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.progress import DeviceStatus
 from abbe.service.domain.push_entry import PushTransition
@@ -197,6 +198,14 @@ class NewJob(RequestBody):
     recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
     rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
     alarm: Annotated[int, Field(ge=0, le=LARGEST, description="A full campaign looks for the cause of this alarm; 0: of none")] = 0
+    resume: Annotated[
+        str,
+        Field(
+            max_length=WORD,
+            description="Interrupted full campaign to complete: complete runs are kept, every other set-up is mounted anew. Whoever asks "
+            "for it states that nothing was repaired, adjusted or moved at the machine since",
+        ),
+    ] = ""
 
 
 class ApproveBody(RequestBody):

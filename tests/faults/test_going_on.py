@@ -16,7 +16,7 @@ from abbe.service.domain.progress import Progress
 from abbe.service.errors import DoorOpen, EstopPressed, Interlock, PreconditionsChanged, Stopped, TemperatureOutside, UnsafeToMove
 from abbe.service.sequences.control import State, Suspending, Watching
 from abbe.service.sequences.journal import HAND
-from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadLaser, RecordPath
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadLaser, RecordPath, Unmount
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import AtStep, Bench, bench, small
 
@@ -152,6 +152,19 @@ async def test_after_an_e_stop_a_laser_run_goes_on_and_says_so(place):
     found = await going_on(b, store, await broken_off(b, store))
     assert found.messages[-1].startswith("set-up S is still mounted: test resumes after point")
     assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
+
+
+async def test_where_nobody_is_asked_every_set_up_is_cleared_away_and_mounted_anew(place):
+    b, store = place
+    plan = await broken_off(b, store)
+    found = await resume(b.session, store, b.site, plan, "c", None)
+    assert found.messages[-1] == "set-up S is mounted anew for test: nobody was asked whether it is untouched"
+    (item,) = found.start.values()
+    assert [type(step) for step in item.left.steps[:1]] == [Unmount], "what still stands is cleared away before anything moves"
+    await measure(b.session, store, b.site, plan, options=MeasureOptions(resumed=found))
+    assert statuses(store) == [("test", "failed"), ("test-2", "complete")]
+    setups = [run.start_doc["setup"]["setup_id"] for run in store.runs.all(store.campaigns.all()[-1].id)]
+    assert setups == ["S", "S-2"]
 
 
 async def test_a_mirror_that_was_knocked_is_mounted_anew(place):

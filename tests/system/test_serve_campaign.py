@@ -13,6 +13,7 @@ from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import httpx
 import pytest
@@ -35,9 +36,9 @@ from tests.system.test_serve_rollback import PHRASE, client
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(900)]
 LONG = os.environ.get("ABBE_TEST_LONG")
 NUMBER = r"([+-]?\d+(?:\.\d+)?)"
-BAR = re.compile(rf"hang in the {NUMBER} mm bar", re.IGNORECASE)
+BAR = re.compile(rf"mount the {NUMBER} mm bar", re.IGNORECASE)
 BEAM = re.compile(rf"beam along X {NUMBER}  Y {NUMBER}  Z {NUMBER},")
-SET_UPS = 19
+SET_UPS, RUNS, BARS, CHECKED = 19, 21, 3, 4
 
 
 def tokens(url: str) -> dict[str, dict[str, str]]:
@@ -59,9 +60,9 @@ class Page:
     who: dict[str, dict[str, str]]
     mounted: list[str] = field(default_factory=list)
 
-    def start(self, key: str, who: str = "mia") -> httpx.Response:
+    def start(self, key: str, who: str = "mia", resume: str = "") -> httpx.Response:
         headers = {**self.who[who], "Idempotency-Key": key}
-        return self.http.post("/api/v1/jobs", json={"recipe": "identification"}, headers=headers)
+        return self.http.post("/api/v1/jobs", json={"recipe": "identification", "resume": resume}, headers=headers)
 
     def job(self, place: str) -> dict[str, Any]:
         return dict(self.http.get(place, headers=self.who["vera"]).json())
@@ -87,7 +88,7 @@ class Page:
             along = [float(part) for part in beam.groups()]
             self.sims.ask("mount_laser", beam=[part / math.hypot(*along) for part in along])
         else:
-            assert "Take bar, cup and mirror away" in text, text
+            assert "Take bar, cup, mirror or artefact away" in text, text
             self.sims.ask("unmount")
         self.mounted.append(text)
 
@@ -110,16 +111,36 @@ def stopped_at_the_first_prompt(page: Page) -> str:
     return name[1]
 
 
-def led_to_its_end(page: Page) -> dict[str, Any]:
+def stopped_at_the_third_bar(page: Page) -> str:
+    """Two bars are measured, and the third stands when a person stops; gives the name that the screen of a new measurement resumes."""
+    place = page.start("k2").headers["Location"]
+    now = page.next_prompt(place, 0)
+    while sum("mm bar" in asked for asked in page.mounted) < BARS:
+        page.mount(now["ask"])
+        assert page.says_done(place, now["prompt"]) == 202
+        now = page.next_prompt(place, now["prompt"])
+    assert page.http.post(f"{place}/stop", headers=page.who["mia"]).status_code == 202
+    assert page.next_prompt(place, now["prompt"])["state"] == "done: stopped"
+    offered = page.http.get("/new?recipe=identification", headers=page.who["mia"]).text
+    name = re.search(r"/new\?recipe=identification&amp;resume=([^\"]+)", offered)
+    assert name is not None, offered
+    address = f"/new?recipe=identification&resume={name[1]}"
+    attribute = f'data-resume="{unquote(name[1])}"'
+    wait_for(lambda: attribute in page.http.get(address, headers=page.who["mia"]).text, 30, "the machine to be free")
+    return unquote(name[1])
+
+
+def led_to_its_end(page: Page, resume: str) -> dict[str, Any]:
     """Every prompt is answered once it was done, by whoever may; an old number or another's word moves nothing."""
-    sent = page.start("k2")
+    sent = page.start("k4", resume=resume)
     place = sent.headers["Location"]
-    assert page.start("k2").headers["Location"] == place
-    assert page.start("k3").status_code == 409
+    assert page.start("k4", resume=resume).headers["Location"] == place
+    assert page.start("k5").status_code == 409
+    before = len(page.mounted)
     now = page.next_prompt(place, 0)
     while not now["ended_utc"]:
         number = now["prompt"]
-        assert (number, now["state"]) == (len(page.mounted) + 1, "asking")
+        assert (number, now["state"]) == (len(page.mounted) - before + 1, "asking")
         for wrong in {number - 1, number + 1} - {0}:
             assert page.says_done(place, wrong) == 409
         assert page.says_done(place, number, "vera") == 403
@@ -151,21 +172,28 @@ def test_somebody_at_the_page_is_led_to_a_proposal(tmp_path: Path) -> None:
         assert "identification" in http.get("/api/v1/jobs", headers=who["vera"]).json()["recipes"]
         assert page.start("k0", "vera").status_code == 403
         first = stopped_at_the_first_prompt(page)
-        done = led_to_its_end(page)
+        campaign = stopped_at_the_third_bar(page)
+        before = len(page.mounted)
+        done = led_to_its_end(page, campaign)
         print(done["state"], done["text"], len(page.mounted))  # noqa: T201 - what this is run for
         assert (done["state"], done["prompt"], done["ask"]) == ("done: proposed", 0, ""), done["text"]
-        assert sum("hang in" in asked or "beam along" in asked for asked in page.mounted) == SET_UPS
+        again = page.mounted[before:]
+        assert "Take bar, cup, mirror or artefact away" in again[0], "what still stands is cleared away before anything moves"
+        assert sum("mm bar" in asked or "beam along" in asked for asked in again) == SET_UPS - BARS + 1
         assert f"/proposal?id={done['proposal']}" in http.get("/live", headers=who["mia"]).text
         assert http.get(f"/proposal?id={done['proposal']}", headers=who["mia"]).status_code == 200
         assert running.terminate()[0] == 0
     with Store.open(url) as store:
         assert begun_source(store, first).recipe == "identification"
+        runs = store.runs.all(store.campaigns.find(campaign).id)
+        complete = [run.label for run in runs if run.visible_status == "complete"]
+        assert len(complete) == len(set(complete)) == RUNS
         proposed = load(store, done["proposal"])
         assert (proposed.by, proposed.solution_id) == ("mia", done["solution"])
         assert proposal_status(store, done["proposal"], proposed, SystemClock().utc().timestamp()).word == "proposed"
         assert (store.proposals.approvals(done["proposal"]), store.pushes.entries("sim")) == ([], [])
         told = [(r.who, r.outcome) for r in store.audit.events(1000) if r.action == "campaign"]
-        assert told == [("token:mia/test", word) for word in ("begun", "stopped", "begun", "proposed")]
+        assert told == [("token:mia/test", word) for word in ("begun", "stopped", "begun", "stopped", "begun", "proposed")]
         started = [(r.who, r.outcome) for r in store.audit.events(1000) if r.action == "POST /api/v1/jobs"]
         assert ("token:vera/test", "refused 403") in started
         assert AuditBook(store, url).verify() == []
@@ -189,7 +217,9 @@ def test_a_browser_leads_from_the_checklist_through_the_set_ups(tmp_path: Path) 
         screen.goto(f"{base}/new?recipe=identification")
         assert screen.locator("#start ~ ol li").count() == SET_UPS
         assert faults(screen, axe) == []
-        for box in screen.locator("#start input[type=checkbox]").all():
+        boxes = screen.locator("#start input[type=checkbox]").all()
+        assert len(boxes) == CHECKED
+        for box in boxes:
             box.check()
         shot(screen, "serve-campaign-new.png")
         screen.click("#start button")
@@ -213,5 +243,11 @@ def test_a_browser_leads_from_the_checklist_through_the_set_ups(tmp_path: Path) 
         assert "are kept" in screen.inner_text("#live-text")
         assert "abbe" not in screen.inner_text("#live-text"), "a person at the page has no command line"
         assert screen.locator("#by-hand").count() == 0
+        screen.click("#live-again a")
+        screen.click("a[href*='resume=']")
+        assert screen.locator("#start[data-resume^='identification ']").count() == 1
+        assert screen.locator("#start input[type=checkbox]").count() == CHECKED + 1, "that nothing was changed meanwhile"
+        assert faults(screen, axe) == []
+        shot(screen, "serve-campaign-resume.png")
         assert seen.errors == []
         assert only_us(seen)

@@ -227,15 +227,17 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
 
     def on(store: Store) -> MeasureCampaign:
         async def measure(order: CampaignOrder) -> JobOutcome:
-            from abbe.service.jobs.guided_campaign import investigate_guided, named_now, run_guided_campaign
+            from abbe.service.jobs.guided_campaign import investigate_guided, named_for, run_guided_campaign
             from abbe.service.jobs.investigate import InvestigationContext
 
             source = campaign_source(order.recipe, folder)
             plan = source.plan(site.machine)
             context = InvestigationContext(site, store, plan, SystemClock(), order.progress, order.control, live)
             if order.cause is None:
-                return await run_guided_campaign(named_now(context, order.recipe), source, order.by)
-            await investigate_guided(context, source, *order.cause)
+                return await run_guided_campaign(
+                    named_for(context, order.recipe, order.resume), source, order.by, resumes=bool(order.resume)
+                )
+            await investigate_guided(context, source, *order.cause, resume=order.resume)
             return JobOutcome("done", "")
 
         return measure

@@ -156,13 +156,13 @@ class CoreLine:
 
     # ---- requests to the core ---------------------------------------------------------------------------------------
 
-    async def start(self, recipe: str, key: str, who: str, alarm: int = 0) -> Answer:
-        """Start a job; ``alarm``: the alarm whose cause a full campaign looks for. Raises CoreUnavailable if no answer comes.
+    async def start(self, recipe: str, key: str, who: str, alarm: int = 0, resume: str = "") -> Answer:
+        """Start a job; ``alarm``: the alarm whose cause a full campaign looks for; ``resume``: the interrupted campaign that it completes.
 
-        Then the outcome is unknown: repeat the request with the same key.
+        Raises CoreUnavailable if no answer comes. Then the outcome is unknown: repeat the request with the same key.
         """
         number = next(self._numbers)
-        return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who, alarm=alarm))
+        return await self._ask(StartJob(request=number, recipe=recipe, key=key, who=who, alarm=alarm, resume=resume))
 
     async def steer(self, job: str, how: Steering, who: str) -> Answer:
         """Stop, abort, pause or resume a running job. Raises CoreUnavailable if no answer comes."""

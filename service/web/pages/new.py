@@ -15,6 +15,7 @@ from pydantic import AfterValidator
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import Rules
 from abbe.service.queries.alarms import path_of_alarm
+from abbe.service.queries.interrupted import interrupted_campaign
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
@@ -32,16 +33,21 @@ Rate = Annotated[int, Query(ge=1, le=1000)]
 def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
     """Add the screen of a new measurement to the application. ``plans``: recipes that can be rehearsed.
 
-    For an ``alarm`` the full campaign also looks for its cause.
+    For an ``alarm`` the full campaign also looks for its cause. With ``resume`` it completes this campaign, if that is the last one and
+    was interrupted.
     """
 
     @app.get("/new", include_in_schema=False)
     @needs(Permission.READ)
-    async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ, alarm: Number = None) -> HTMLResponse:
+    async def new(recipe: Recipe = "", rate_hz: Rate = USUAL_HZ, alarm: Number = None, resume: Text = "") -> HTMLResponse:
         status = await context.source.status()
         rate_hz = rate_hz if rate_hz in plans.rates_hz else USUAL_HZ
         choices = plans.choices()
         chosen = recipe if recipe in choices else next(iter(choices), "")
+        interrupted = await context.read(interrupted_campaign, context.reader, chosen) if chosen == CAMPAIGN else None
+        resumes = interrupted is not None and interrupted.name == resume
+        if interrupted is not None and resumes:
+            rate_hz, alarm = interrupted.rate_hz, interrupted.alarm
         dry = await asyncio.to_thread(plans.run, chosen, rate_hz, current().drawn("mm"))
         alarm = (alarm or 0) if chosen == CAMPAIGN else 0
         way = await context.read(path_of_alarm, context.reader, alarm) if alarm else None
@@ -54,6 +60,8 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
             rate_hz=rate_hz,
             dry=dry,
             guided=chosen == CAMPAIGN,
+            interrupted=interrupted,
+            resumes=resumes,
             alarm=alarm,
             begins=None if way is None else way.begins,
             max_feed=None if plans.machine is None else plans.machine.max_feed_mm_min,

@@ -3,10 +3,10 @@
 const form = document.getElementById("start");
 
 async function start() {
-  const { recipe, rate, alarm, key, csrf } = form.dataset;
+  const { recipe, rate, alarm, resume, key, csrf } = form.dataset;
   const answer = await fetch("/api/v1/jobs", {
     method: "POST",
-    body: JSON.stringify({ recipe, rate_hz: Number(rate), alarm: Number(alarm) }),
+    body: JSON.stringify({ recipe, rate_hz: Number(rate), alarm: Number(alarm), resume }),
     headers: { "Content-Type": "application/json", "X-CSRF-Token": csrf, "Idempotency-Key": key },
   });
   if (answer.ok) {

@@ -61,7 +61,7 @@ class Bench:
 
     async def start(self, recipe: str = "quick-check", key: str = "", who: str = "user:bob") -> Answer:
         self.numbers += 1
-        answer = await self.book.start(StartJob(request=self.numbers, recipe=recipe, key=key, who=who, alarm=0))
+        answer = await self.book.start(StartJob(request=self.numbers, recipe=recipe, key=key, who=who, alarm=0, resume=""))
         assert answer.request == self.numbers
         await settle()
         return answer

@@ -81,8 +81,8 @@ class Bench:
             raise self.end
         return self.end
 
-    async def start(self, recipe: str = "identification", key: str = "", who: str = "token:bob/ci") -> Answer:
-        answer = await self.book.start(StartJob(request=1, recipe=recipe, key=key, who=who, alarm=0))
+    async def start(self, recipe: str = "identification", key: str = "", who: str = "token:bob/ci", resume: str = "") -> Answer:
+        answer = await self.book.start(StartJob(request=1, recipe=recipe, key=key, who=who, alarm=0, resume=resume))
         if answer.outcome == "done":
             await self.until(lambda: self.book.latest()[0].prompt or self.book.latest()[0].ended_utc is not None)
         return answer
@@ -189,6 +189,17 @@ async def test_one_key_is_one_campaign_and_only_declared_ones_are_started(bench:
     assert await bench.steer(first.job, "stop") == "done"
     await bench.ended()
     assert (await bench.start("own.toml")).outcome == "done"
+
+
+async def test_only_a_full_campaign_is_resumed_and_the_audit_names_it(bench: Bench) -> None:
+    refused = await bench.start("quick-check", resume="check of noon")
+    assert (refused.outcome, refused.text) == ("conflict", "'quick-check' cannot be resumed: only a full campaign can")
+    first = await bench.start(key="k", resume="campaign of noon")
+    assert (await bench.start(key="k")).outcome == "conflict", "the same key for another work"
+    assert [order.resume for order in bench.orders] == ["campaign of noon"]
+    assert await bench.steer(first.job, "stop") == "done"
+    await bench.ended()
+    assert {target for _, target, _ in bench.recorded()} == {"mill-7, identification, resumes campaign of noon"}
 
 
 @pytest.mark.parametrize(

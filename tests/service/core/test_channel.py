@@ -134,7 +134,7 @@ CORE = [
 WEB = [
     m.Serving("up", 1),
     m.WebHeartbeat("alive"),
-    m.StartJob(request=1, recipe="quick-check", key="k", who="user:bob", alarm=0),
+    m.StartJob(request=1, recipe="quick-check", key="k", who="user:bob", alarm=0, resume=""),
     m.SteerJob(request=2, job="0" * 12, how="pause", who="x"),
     m.ConfirmPrompt(request=3, job="0" * 12, prompt=2, who="user:bob"),
     m.RollBack(request=3, push=7, crc=0xFFFFFFFF, reason="worse since then", key="k", who="user:ann"),
@@ -177,8 +177,8 @@ def test_a_message_that_lacks_or_adds_something_is_refused(message: Any) -> None
 @pytest.mark.parametrize(
     "message",
     [
-        m.StartJob(request=1, recipe="x" * 201, key="", who="user:bob", alarm=0),
-        m.StartJob(request=-1, recipe="x", key="", who="user:bob", alarm=0),
+        m.StartJob(request=1, recipe="x" * 201, key="", who="user:bob", alarm=0, resume=""),
+        m.StartJob(request=-1, recipe="x", key="", who="user:bob", alarm=0, resume=""),
         m.SteerJob(request=1, job="0", how="fly", who="x"),  # type: ignore[arg-type]
         m.RollBack(request=1, push=7, crc=2**32, reason="worse", key="k", who="user:ann"),
         m.RollBack(request=1, push=7, crc=1, reason="", key="k", who="user:ann"),

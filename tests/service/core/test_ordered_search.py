@@ -43,7 +43,7 @@ class Searching:
         context = OrderContext("mill-7", bench._may, AuditBook(bench.store, bench.url))
         bench.book.full = full_campaigns(context, ("identification",), self.measure, bench._may, bench.desk)
         bench.book.open(bench.scheduler, tasks)
-        return await bench.book.start(StartJob(request=1, recipe=recipe, key="", who="user:bob", alarm=alarm))
+        return await bench.book.start(StartJob(request=1, recipe=recipe, key="", who="user:bob", alarm=alarm, resume=""))
 
 
 async def test_a_person_starts_the_search_for_the_cause_and_its_lines_name_her(bench: Bench) -> None:

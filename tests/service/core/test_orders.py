@@ -172,7 +172,7 @@ async def test_what_is_refused_is_one_line_and_nothing_is_begun(bench: Bench) ->
 
 async def test_nothing_comes_between_two_jobs(bench: Bench) -> None:
     await bench.push({}, OLD, NEW, KEPT)
-    assert (await bench.book.start(StartJob(request=1, recipe="quick-check", key="", who="user:bob", alarm=0))).outcome == "done"
+    assert (await bench.book.start(StartJob(request=1, recipe="quick-check", key="", who="user:bob", alarm=0, resume=""))).outcome == "done"
     await settle()
     answer = await bench.ask()
     assert (answer.outcome, answer.text) == ("busy", "the machine is in use: quick-check")

@@ -24,7 +24,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
-from abbe.service.errors import Aborted, NotObservable, Stopped, TableMismatch, TableRefused
+from abbe.service.errors import Aborted, NotObservable, PreconditionsChanged, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
 from abbe.service.jobs import investigate
 from abbe.service.jobs.investigate import InvestigationContext
@@ -63,7 +63,7 @@ def pretended(**site: Any) -> Any:
     )
 
 
-async def measured(bench: Any, source: Any) -> None:
+async def measured(bench: Any, source: Any, **_: object) -> None:
     """All of it, without a device."""
 
 
@@ -198,16 +198,27 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
         assert isinstance(asking.exception(), Stopped) == (number == 2)
 
 
-@pytest.mark.parametrize("searching", [False, True])
-async def test_what_is_broken_off_tells_how_it_is_gone_on_with_and_that_a_new_search_is_not(
-    searching: bool, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize("resumes", [False, True])
+async def test_what_is_broken_off_tells_how_it_is_resumed_and_what_resumes_begins_no_campaign(
+    resumes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    told_by_resume = SimpleNamespace(campaign=(4, 0))
+    begun: list[object] = []
+
     @asynccontextmanager
     async def session(*_: object, **__: object) -> AsyncIterator[Any]:
         yield SimpleNamespace(controller=None)
 
-    async def stopped(*_: object, **__: object) -> Any:
+    async def stopped(*_: object, campaign: object, options: Any, **__: object) -> Any:
+        begun.append((campaign, options.resumed))
         raise Stopped("by a person", "")
+
+    async def started(*_: object, **__: object) -> tuple[int, int]:
+        return 7, 0
+
+    async def resumed(*given: object) -> Any:
+        assert given[-2:] == ("full 1", None), "nobody is asked whether a set-up is untouched: it is mounted anew"
+        return told_by_resume
 
     for name, instead in (
         ("lock_machine", lambda _: nullcontext()),
@@ -215,7 +226,8 @@ async def test_what_is_broken_off_tells_how_it_is_gone_on_with_and_that_a_new_se
         ("paced", lambda plan, _: plan),
         ("check_devices", all_there),
         ("_check_table_acts", all_there),
-        ("start_campaign", all_there),
+        ("start_campaign", started),
+        ("resume_campaign", resumed),
         ("measure", stopped),
     ):
         monkeypatch.setattr(work, name, instead)
@@ -223,10 +235,11 @@ async def test_what_is_broken_off_tells_how_it_is_gone_on_with_and_that_a_new_se
     bench.live = None
     bench.control.now(State.RUNNING)
     with pytest.raises(Stopped) as told:
-        await work._measured(bench, {}, all_there if searching else None)  # type: ignore[arg-type]
+        await work._measured(bench, {}, resumes=resumes)  # type: ignore[arg-type]
+    assert begun == [((4, 0), told_by_resume) if resumes else ((7, 0), None)]
     (note,) = told.value.__notes__
     assert "abbe measure -m MACHINE.toml --resume 'full 1'" in note
-    assert ("begins with the first set-up" in note) == searching
+    assert "the screen of a new measurement resumes it" in note
 
 
 class Lines:
@@ -246,7 +259,8 @@ async def test_the_cause_of_an_alarm_is_measured_with_a_person_and_its_lines_com
     await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
     alarm = await lines.note(AlarmKind.ORDERED, AlarmFacts(name="petra"))
 
-    async def led(context: Any, source: Any, begins: Any) -> list[int]:
+    async def led(context: Any, source: Any, begins: Any, *, resumes: bool) -> list[int]:
+        assert not resumes
         assert [line.kind for line in lines.lines] == ["raised", "ordered"], "nothing has begun before the devices are checked"
         await begins()
         assert (lines.lines[-1].kind, context.plan.name) == ("begun", lines.lines[-1].facts.campaign)
@@ -261,6 +275,26 @@ async def test_the_cause_of_an_alarm_is_measured_with_a_person_and_its_lines_com
     await work.investigate_guided(bench, {}, alarm, lines.note)  # type: ignore[arg-type]
     assert [line.kind for line in lines.lines[2:]] == ["begun", "measured", "ended"]
     assert lines.lines[3].facts.text.endswith("is measured: 2 runs")
+
+
+async def test_a_stopped_search_resumes_its_own_campaign_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+    lines = Lines()
+    await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
+    await lines.note(AlarmKind.BEGUN, AlarmFacts(campaign="alarm 1 of noon"))
+    alarm = await lines.note(AlarmKind.ORDERED, AlarmFacts(name="petra"))
+    seen: list[tuple[str, bool]] = []
+
+    async def led(context: Any, source: Any, begins: Any, *, resumes: bool) -> list[int]:
+        seen.append((context.plan.name, resumes))
+        raise Stopped("by a person", "")
+
+    monkeypatch.setattr(work, "_measured", led)
+    bench: Any = InvestigationContext(pretended().site, None, CampaignPlan("", ()), SystemClock(), ignore_progress)  # type: ignore[arg-type]
+    with pytest.raises(Stopped):
+        await work.investigate_guided(bench, {}, alarm, lines.note, resume="alarm 1 of noon")  # type: ignore[arg-type]
+    with pytest.raises(PreconditionsChanged, match="is not the last one of alarm 1"):
+        await work.investigate_guided(bench, {}, alarm, lines.note, resume="alarm 1 of morning")  # type: ignore[arg-type]
+    assert seen == [("alarm 1 of noon", True)]
 
 
 async def test_without_certificates_no_cause_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:

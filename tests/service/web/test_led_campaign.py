@@ -19,6 +19,7 @@ from abbe.service.domain.job_state import JobState
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
+from abbe.service.sequences import journal
 from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
@@ -163,7 +164,7 @@ async def test_it_is_started_from_the_checklist(desk: Desk, plant: Plant) -> Non
     sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "rate_hz": 500}, headers=who | {"Idempotency-Key": "k"})
     assert sent.status_code == 202
     assert desk.asked[-1] == StartJob(
-        request=desk.asked[-1].request, recipe=f"{CAMPAIGN} at 500 Hz", key="k", who="user:a-metrologist", alarm=0
+        request=desk.asked[-1].request, recipe=f"{CAMPAIGN} at 500 Hz", key="k", who="user:a-metrologist", alarm=0, resume=""
     )
 
 
@@ -176,8 +177,32 @@ async def test_the_cause_of_an_alarm_is_searched_from_the_same_checklist(desk: D
     assert 'data-alarm="0"' in await desk.page("/new?recipe=quick-check&alarm=3", who), "a check finds no cause"
     sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "alarm": 3}, headers=who)
     assert sent.status_code == 202
-    assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=CAMPAIGN, key="", who="user:a-metrologist", alarm=3)
+    assert desk.asked[-1] == StartJob(request=desk.asked[-1].request, recipe=CAMPAIGN, key="", who="user:a-metrologist", alarm=3, resume="")
     assert plant.store.audit.events(1)[0].target == f"job {NUMBER}, recipe {CAMPAIGN}, alarm 3"
+
+
+async def test_an_interrupted_campaign_is_resumed_once_somebody_says_that_nothing_was_changed(desk: Desk, plant: Plant) -> None:
+    who, store = plant.session("metrologist"), plant.store
+    await desk.says(ENDED, replace(MOMENT, check=None, changes=7))
+    assert 'data-resume=""' in await desk.page(f"/new?recipe={CAMPAIGN}&resume=noon", who), "there is nothing to resume"
+    machine = next(one for one in store.machines.all() if one.name == NAME)
+    number = store.campaigns.add(machine.id, "noon & after", {})
+    store.checkpoints.add(
+        number, journal.BEGUN, {"plan": "h", "source": {"recipe": CAMPAIGN, "rate_hz": 500}, "boot_id": 1, "table_crc": 2}
+    )
+    store.runs.finish(store.runs.start(number, "r1", "laser_linear", "identify", {}), "complete", "", None)
+    store.checkpoints.add(number, journal.ENDED, {"how": "stopped"})
+    offered = await desk.page(f"/new?recipe={CAMPAIGN}", who)
+    assert "Complete runs: 1." in offered
+    assert offered.count('type="checkbox"') == 4, "a new campaign asks nothing more"
+    (link,) = re.findall(r'href="(/new[^"]*resume=[^"]*)"', offered)
+    shown = await desk.page(link.replace("&amp;", "&"), who)
+    assert ('data-resume="noon &amp; after"' in shown, 'data-rate="500"' in shown, shown.count('type="checkbox"')) == (True, True, 5)
+    assert "nobody has repaired, adjusted or moved anything at the machine" in shown
+    sent = await desk.client.post("/api/v1/jobs", json={"recipe": CAMPAIGN, "resume": "noon & after"}, headers=who)
+    assert sent.status_code == 202
+    assert desk.asked[-1].resume == "noon & after"  # type: ignore[union-attr]
+    assert store.audit.events(1)[0].target == f"job {NUMBER}, recipe {CAMPAIGN}, resumes noon & after"
 
 
 async def test_before_the_start_the_screen_says_what_comes_first_and_asks_for_no_set_up_where_nothing_is_mounted(
