@@ -204,7 +204,8 @@ def at_the_button(screen: Screen, page: Page, number: int) -> None:
     screen.wait_for_selector(f"#by-hand button[data-prompt='{number}']", timeout=120_000)
     page.mount(screen.inner_text("#by-hand-text"))
     screen.click("#by-hand button")
-    screen.wait_for_selector("#by-hand", state="hidden", timeout=10_000)
+    # The next prompt may come before anybody sees that there is none.
+    screen.wait_for_selector(f"#by-hand:not([hidden]) button[data-prompt='{number}']", state="detached", timeout=60_000)
 
 
 @pytest.mark.browser
