@@ -20,6 +20,7 @@ from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexp
 from abbe.models.discovery.left_out import left_out_gap
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
+from abbe.models.discovery.residues import companions, leaning, residues, shared
 from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
 from abbe.models.discovery.sensors import exchanged_sensor
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
@@ -50,31 +51,9 @@ OFFSET = "offset"
 """Prefix of forms whose first column is a constant: the start value of a sensor is not part of the effect."""
 TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a thermal time constant: of several time constants, a short campaign shows only the short ones."""
-RESIDUE_SHARE = 0.001
-"""A name with less than this share of the largest evidence cannot be distinguished from a residue of the strongest effect."""
-SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
-"""Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
-this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
-less like scatter. A true stick-slip had 1.0 % of a pitch error."""
-AXIS_SHARE = 0.02
-AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
-"""Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect
-is a residue of the other."""
-ROUGH = (*AT_TURNS, "cyclic_error")
-"""Effects with corners or waves."""
-KIN_SHARE = 0.03
-CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
-LAG = ("contour_lag", "servo_mismatch")
-SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
-"""Groups of related effects: thermal courses, curves over the position, lags of drives. If an effect deviates from its formula by a sixth
-(3 % of its evidence), the deviation resembles another effect of the group. In 345 cases (150 others for lags) ten false names had 0.2 to
-2.9 % of the evidence of the strong effect; one true name had 9 %."""
 REST_SHARE = 0.1
 """If part of the gap has no explanation, a name with less than this share of that part's evidence is a residue of it: an unknown effect
 always resembles some name a little. In cases whose effects were all found, no such part remains."""
-COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
-"""A name is a residue of another if its evidence is below `COMPANION_SHARE` of the other's and their signals overlap by more than
-`COMPANION_OVERLAP`."""
 STARTS = 2000.0
 """Assumed number of starts that are compared in a campaign; it bounds the p-value of the best start."""
 
@@ -142,62 +121,6 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
     scale = np.linalg.norm(basis, axis=0)
     scale[scale == 0.0] = 1.0
     return np.asarray(np.linalg.lstsq(basis / scale, raw, rcond=1e-9)[0] / scale[:, None])[:k]
-
-
-def residues(effects: Sequence[NamedEffect], scatter: frozenset[str]) -> Mapping[str, str]:
-    """Find named effects that may be mere residues: deviations of a stronger effect from its formula.
-
-    An effect is a residue if its evidence is below
-
-    - 0.1 % of that of any stronger effect;
-    - for stick-slip and vibration: 1 % of that of an effect at reversals or a cyclic error, 0.3 % of that of another mean effect;
-    - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
-      mismatch);
-    - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
-      positioning and thermal growth of the same axis), another lag of the drives.
-
-    Parameters
-    ----------
-    effects : all named effects. scatter : labels of those found in the variance.
-
-    Returns
-    -------
-    dict
-        Reason as text, by label.
-    """
-    out: dict[str, str] = {}
-    for small in effects:
-        for big in sorted(effects, key=lambda e: -e.evidence):
-            share = _share(small, big, big.label in scatter)
-            if small.evidence < share * big.evidence:
-                share_text = f"evidence {small.evidence:.0f}, only {small.evidence / big.evidence:.1%} of that of {big.label}"
-                out[small.label] = f"{share_text}: possibly only the deviation of {big.label} from its formula"
-                break
-    return out
-
-
-def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
-    """Return the share of the evidence of ``big`` below which ``small`` is its residue (`residues`)."""
-    if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
-        return AXIS_SHARE
-    if small.name == "beam_outliers" and any(form.startswith("harmonics") for form in big.forms):
-        return SCATTER_SHARE  # readings beside the jumps of a saw-tooth
-    grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
-    clock = small.name in CLOCK and big.name in CLOCK
-    lag = small.name in LAG and big.name in LAG and small.name != big.name
-    if grown or clock or lag or (small.name in SHAPE and big.name in SHAPE and _together(small.key, big.key)):
-        return KIN_SHARE
-    if small.name in SCATTER and not big_is_scatter:
-        return SCATTER_SHARE if big.name in ROUGH else SMOOTH_SHARE
-    return RESIDUE_SHARE
-
-
-def _together(a: str, b: str) -> bool:
-    """Whether two keys (EYX or X) share the moving axis or the deviating direction; an empty key (ram sag) shares with all."""
-    if not a or not b or a[-1] == b[-1]:
-        return True
-    directions = [key[1] for key in (a, b) if len(key) == 3 and key[1] in "XYZ"]
-    return len(directions) == 2 and directions[0] == directions[1]
 
 
 @dataclass(frozen=True)
@@ -292,9 +215,9 @@ def _judge(
 
     ``rest``: evidence, in nats, of the residuals above the noise that all findings together leave.
     """
-    companions = _companions(problem, found, solved)
+    companion = companions(problem, found, solved)
     uneven, waves = _uneven(problem, found)
-    named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companions and f.pick.label not in uneven]
+    named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companion and f.pick.label not in uneven]
     needed = _needed(problem, solved, named)
     mean = {i: replace(_named(problem, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
     scatter = [_of_scatter(f) for f in loud if not is_unnamed(f.name)]
@@ -304,7 +227,8 @@ def _judge(
         label: f"evidence {own:.0f}, but {rest:.0f} is left without explanation: possibly only a part of that"
         for label, own in small.items()
     }
-    left = {**residues(names, frozenset(e.label for e in scatter)), **left}
+    left = {**residues(names, frozenset(e.label for e in scatter), shared(problem, found)), **left}
+    left |= leaning(problem, found, {*left, *(found[i].pick.label for i in companion)})
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
     wander = wandering(problem)
     least = REST_SHARE * max((w.evidence for w in wander), default=0.0)  # noise that wanders has waves and moments by chance
@@ -316,7 +240,7 @@ def _judge(
         rejected += [
             (e.label, f"evidence {e.evidence:.0f}, less than that of the structures without a name: not named beside them") for e in effects
         ]
-    for i, j in companions.items():
+    for i, j in companion.items():
         share_text = f"evidence {found[i].score / 2.0:.0f}: possibly only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
@@ -396,20 +320,6 @@ def _p_value(found: Sequence[Selection], loud: Sequence[VarianceFinding], lack: 
     bounds: list[float] = [STARTS * float(chi2_above(f.gain, 2 + len(f.pick.effect.shape) + len(f.pick.forms))) for f in found]
     bounds += [float(np.exp(-f.evidence)) for f in loud]
     return min(1.0, *bounds) if bounds else 1.0
-
-
-def _companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Map the index of each finding that is only a residue to the index of the finding of which it is a residue."""
-    power = []
-    for pick, c in zip(solved.picks, solved.coefficients, strict=True):
-        size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
-        power.append(np.sqrt(size / max(size.sum(), 1e-300)))
-    out: dict[int, int] = {}
-    for i, small in enumerate(found):
-        for j, big in enumerate(found):
-            if small.score < COMPANION_SHARE * big.score and not big.pick.unnamed and power[i] @ power[j] > COMPANION_OVERLAP:
-                out[i] = j
-    return out
 
 
 def _named(problem: WhitenedProblem, found: Selection, solved: SolvedModel, i: int, rivals: Sequence[Rival]) -> NamedEffect:

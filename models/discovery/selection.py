@@ -52,6 +52,8 @@ UNSURE = 3.84
 EXCLUDED = 12.0
 """A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8
+LIKE = 0.3
+"""Least share of the gain of the names that it would replace at which a rival in its textbook form is refined."""
 KIN = 0.02
 """Rivals that explain all but this share of the gain are not excluded, because a real effect deviates that much from its formula."""
 
@@ -276,10 +278,13 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
             picks[form[0]] = form[1]
         elif new is not None:
             picks.append(new.pick)
-            picks = dropped(contest, joined(contest, swapped(contest, picks)))
+            picks = dropped(contest, swapped(contest, picks))
             in_vain = [*in_vain, new.pick.label] if new.pick.label not in {p.label for p in picks} else []
         else:
-            break
+            fewer = merged(contest, picks)
+            if len(fewer) == len(picks):
+                break
+            picks, in_vain = dropped(contest, fewer), []
     return weighed(contest, dropped(contest, picks))
 
 
@@ -301,22 +306,30 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
     return picks
 
 
-def joined(contest: Contest, picks: list[Pick]) -> list[Pick]:
-    """Replace two picks of the same effect by a third pick that scores higher: a lag of Y looks much like equal leads of X and Z."""
+def merged(contest: Contest, picks: list[Pick]) -> list[Pick]:
+    """Replace two picks by one name that scores higher than both together.
+
+    One effect of the true form can look like two of the textbook form: a lag of Y like equal leads of X and Z, a bed that bends double like
+    two curves. So the one name is compared with its forms (`Form`). Two structures without a name are not replaced.
+    """
+    problem = contest.problem
     for i, j in combinations(range(len(picks)), 2):
         a, b = picks[i], picks[j]
-        if a.effect.name != b.effect.name or a.unnamed:
+        if a.unnamed and b.unnamed:
             continue
         rest = [p for k, p in enumerate(picks) if k not in (i, j)]
-        rows = rows_for(contest.problem, rest)
-        both = gain_of(contest.problem, a, rows) + gain_of(contest.problem, b, rows_for(contest.problem, [*rest, a]))
-        beat = both - contest.price(a) - contest.price(b)
-        others_of_kind = contest.shortlist(rows, [a.label, b.label, *(p.label for p in rest)], most=len(contest.widths))
-        one = (refined(contest.problem, f.pick, rows) for f in others_of_kind if f.pick.effect.name == a.effect.name)
-        tried = [Selection(pick, gain, gain - contest.price(pick)) for pick, gain in one]
-        best = max(tried, key=lambda f: f.score, default=None)
-        if best is not None and best.score > beat:
-            return joined(contest, [*rest, best.pick])
+        rows = rows_for(problem, rest)
+        both = gain_of(problem, a, rows) + gain_of(problem, b, rows_for(problem, [*rest, a]))
+        tried = []
+        for f in contest.shortlist(rows, [p.label for p in rest], TRIED):
+            if not f.pick.unnamed and f.gain > LIKE * both:
+                one, gain = refined(problem, f.pick, rows)
+                one, _, _ = _formed(contest, one, rows, gain)
+                one, gain = refined(problem, one, rows, sweeps=1)  # the forms move the best pitch or time constant
+                tried.append((gain - contest.price(one), one))
+        best = max(tried, key=lambda t: t[0], default=None)
+        if best is not None and best[0] > both - contest.price(a) - contest.price(b):
+            return merged(contest, [*rest, best[1]])
     return picks
 
 
@@ -382,7 +395,7 @@ def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Riva
     without = [p.label for p in picks]
     out = []
     for candidate in contest.shortlist(rows, without, TRIED):
-        if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < 0.3 * own.gain:
+        if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < LIKE * own.gain:
             continue
         pick, gain = refined(contest.problem, candidate.pick, rows)
         pick, gain, score = _formed(contest, pick, rows, gain)

@@ -10,10 +10,12 @@ import pytest
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.instrument_noise import fine
 from abbe.models.discovery.lack import floors
+from abbe.models.discovery.selection import Contest, merged
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path
@@ -44,6 +46,21 @@ def test_two_pitches_of_one_axis_are_two_effects_with_their_sizes() -> None:
     sizes = {e.label: (abs(e.strength), e.parameters["pitch_mm"][0]) for e in found.effects}
     assert set(sizes) == {"cyclic_error:X", "cyclic_error_second:X"}
     assert sorted(sizes.values()) == [pytest.approx((1.5, 27.0), rel=0.05), pytest.approx((2.0, 20.0), rel=0.05)]
+
+
+def test_a_wave_and_its_double_pitch_are_one_wave_with_harmonics() -> None:
+    def bent(path: Path) -> F1:
+        x = path.at.q_mm[:, 0]
+        return np.asarray(2.0 * np.sin(2.0 * np.pi * x / 20.0) + 1.5 * np.cos(2.0 * np.pi * x / 10.0))
+
+    case = moved(bent)
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, WAVES)
+    by = {e.name: e for e in WAVES}
+    short, long = Pick(by["cyclic_error"], "X", {"pitch_mm": 10.0}), Pick(by["cyclic_error_second"], "X", {"pitch_mm": 20.0})
+    (wave,) = merged(contest, [short, long])
+    assert (wave.label, [f.name for f in wave.forms]) == ("cyclic_error:X", ["second harmonic"])
+    assert wave.values["pitch_mm"] == pytest.approx(20.0, rel=1e-3)
 
 
 def test_a_wave_whose_pitch_changes_along_the_axis_gets_no_pitch() -> None:

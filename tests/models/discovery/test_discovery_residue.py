@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import NamedEffect
-from abbe.models.discovery.finding import _confounded, _of_scatter, residues
+from abbe.models.discovery.finding import _confounded, _of_scatter
 from abbe.models.discovery.localization import Localization
+from abbe.models.discovery.residues import residues
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
@@ -70,6 +71,15 @@ def test_a_residue_is_weak_and_of_the_same_form(strong: str, weak: str, share: f
     told = residues([effect(strong, 1e4), effect(weak, share * 1e4)], SCATTER)
     assert set(told) == ({weak} if residue else set())
     assert all(strong in why for why in told.values())
+
+
+def test_what_two_related_names_share_belongs_to_the_stronger_one() -> None:
+    pair = [effect("air_refraction", 70.0), effect("laser_cosine", 3.0)]
+    assert residues(pair, SCATTER) == {}
+    told = residues(pair, SCATTER, {("air_refraction", "laser_cosine"): 200.0, ("laser_cosine", "air_refraction"): 140.0})
+    assert told == {
+        "laser_cosine": "evidence 3, only 1.5% of that of air_refraction: possibly only the deviation of air_refraction from its formula"
+    }
 
 
 def test_the_strongest_name_is_never_a_residue() -> None:

@@ -16,7 +16,8 @@ from abbe.models.discovery.candidate_bank import rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.instrument_noise import Colour, unscaled
-from abbe.models.discovery.selection import Contest, joined, weighed
+from abbe.models.discovery.residues import leaning, shared
+from abbe.models.discovery.selection import Contest, Selection, merged, weighed
 from abbe.models.discovery.whitened_problem import SignalProjection, whiten
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path, at_rest, driven
@@ -154,9 +155,44 @@ def test_two_axes_that_lead_give_way_to_the_one_that_trails() -> None:
     contest = Contest.of(problem, CATALOGUE)
     by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
     lead = [by["servo_mismatch:X"], by["servo_mismatch:Z"]]
-    assert [p.label for p in joined(contest, lead)] == ["servo_mismatch:Y"]
-    other = [by["servo_mismatch:Y"], by["backlash:X"]]
-    assert joined(contest, other) == other  # of two kinds: nothing to join
+    assert [p.label for p in merged(contest, lead)] == ["servo_mismatch:Y"]
+    idle = [by["servo_mismatch:Y"], by["backlash:X"]]
+    assert [p.label for p in merged(contest, idle)] == ["servo_mismatch:Y"]
+
+
+def test_two_names_that_both_explain_something_both_stay() -> None:
+    case = campaign(backlash_um=4.0, late_ms=0.2)
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    both = [by["servo_mismatch:Y"], by["backlash:X"]]
+    assert merged(contest, both) == both
+
+
+def test_a_name_that_explains_nothing_without_a_residue_goes_with_the_residue() -> None:
+    case, _ = of_backlash()
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    (true,) = weighed(contest, [by["backlash:X"]])
+    spoilt = Selection(by["servo_mismatch:X"], gain=500.0, score=450.0)
+    repair = Selection(by["servo_mismatch:Z"], gain=300.0, score=250.0)
+    told = leaning(problem, [true, spoilt, repair], {"servo_mismatch:X"})
+    assert set(told) == {"servo_mismatch:Z"}
+    assert "servo_mismatch:X" in told["servo_mismatch:Z"]
+    assert leaning(problem, [true, spoilt, repair], set()) == {}
+
+
+def test_what_two_names_explain_together_counts_for_each_with_the_other_taken_out() -> None:
+    case, _ = of_backlash()
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    (alone,) = weighed(contest, [by["backlash:X"]])
+    beside = weighed(contest, [by["backlash:X"], by["servo_mismatch:X"]])
+    evidence = shared(problem, beside)["backlash:X", "servo_mismatch:X"]
+    assert evidence == pytest.approx(0.5 * alone.score, rel=1e-6)
+    assert evidence > 1.1 * 0.5 * beside[0].score
 
 
 def test_where_nobody_judges_nothing_is_needed_or_not() -> None:

@@ -1,0 +1,144 @@
+"""Names that are only residues: deviations of a stronger effect from its formula, or names that explain nothing without such a residue."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence, Set
+from types import MappingProxyType
+
+import numpy as np
+
+from abbe.models.discovery.answer import NamedEffect
+from abbe.models.discovery.candidate_bank import gain_of, rows_for
+from abbe.models.discovery.selection import Selection
+from abbe.models.discovery.solved_model import SolvedModel
+from abbe.models.discovery.whitened_problem import WhitenedProblem
+
+RESIDUE_SHARE = 0.001
+"""A name with less than this share of the largest evidence cannot be distinguished from a residue of the strongest effect."""
+SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
+"""Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
+this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
+less like scatter. A true stick-slip had 1.0 % of a pitch error."""
+AXIS_SHARE = 0.02
+AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
+"""Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect
+is a residue of the other."""
+ROUGH = (*AT_TURNS, "cyclic_error")
+"""Effects with corners or waves."""
+KIN_SHARE = 0.03
+CLOCK = ("bar_thermal", "axis_thermal_growth", "spindle_thermal_drift", "squareness_thermal")
+LAG = ("contour_lag", "servo_mismatch")
+LASER_SCALE = ("laser_cosine", "air_refraction")
+SHAPE = ("straightness", "angular_error", "positioning_nonlinear", "nonrigid_bed", "ram_sag")
+"""Groups of related effects: thermal courses, lags of drives, scales of the laser, curves over the position. If an effect deviates from
+its formula by a sixth (3 % of its evidence), the deviation resembles another effect of the group. In 345 cases (150 others for lags) ten
+false names had 0.2 to 2.9 % of the evidence of the strong effect; one true name had 9 %."""
+COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
+"""A name is a residue of another if its evidence is below `COMPANION_SHARE` of the other's and their signals overlap by more than
+`COMPANION_OVERLAP`."""
+
+
+def shared(problem: WhitenedProblem, found: Sequence[Selection]) -> dict[tuple[str, str], float]:
+    """Return the evidence of a finding, in nats, with one other finding taken out of the fit, by (label, label of the other).
+
+    Of two findings that resemble each other, each has little evidence beside the other: a part belongs to both.
+    """
+    out = {}
+    for other in found:
+        rest = [f for f in found if f is not other]
+        for f in rest:
+            gain = gain_of(problem, f.pick, rows_for(problem, [g.pick for g in rest if g is not f]))
+            out[f.pick.label, other.pick.label] = 0.5 * (gain - (f.gain - f.score))
+    return out
+
+
+def residues(
+    effects: Sequence[NamedEffect], scatter: frozenset[str], without: Mapping[tuple[str, str], float] = MappingProxyType({})
+) -> Mapping[str, str]:
+    """Find named effects that may be mere residues: deviations of a stronger effect from its formula.
+
+    An effect is a residue if its evidence is below
+
+    - 0.1 % of that of any stronger effect;
+    - for stick-slip and vibration: 1 % of that of an effect at reversals or a cyclic error, 0.3 % of that of another mean effect;
+    - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
+      mismatch);
+    - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
+      positioning and thermal growth of the same axis), another lag of the drives, another scale of the laser.
+
+    Parameters
+    ----------
+    effects : all named effects. scatter : labels of those found in the variance.
+    without : evidence of one effect with the other taken out (`shared`). It counts if it is larger: the part that both explain belongs to
+        the stronger one.
+
+    Returns
+    -------
+    dict
+        Reason as text, by label.
+    """
+    out: dict[str, str] = {}
+    for small in effects:
+        for big in sorted(effects, key=lambda e: -e.evidence):
+            share, whole = _share(small, big, big.label in scatter), max(big.evidence, without.get((big.label, small.label), 0.0))
+            if small.evidence < big.evidence and small.evidence < share * whole:
+                share_text = f"evidence {small.evidence:.0f}, only {small.evidence / whole:.1%} of that of {big.label}"
+                out[small.label] = f"{share_text}: possibly only the deviation of {big.label} from its formula"
+                break
+    return out
+
+
+def _share(small: NamedEffect, big: NamedEffect, big_is_scatter: bool) -> float:
+    """Return the share of the evidence of ``big`` below which ``small`` is its residue (`residues`)."""
+    if small.name in AT_TURNS and big.name in AT_TURNS and small.key[-1:] == big.key[-1:]:
+        return AXIS_SHARE
+    if small.name == "beam_outliers" and any(form.startswith("harmonics") for form in big.forms):
+        return SCATTER_SHARE  # readings beside the jumps of a saw-tooth
+    grown = small.name == "positioning_nonlinear" and big.name == "axis_thermal_growth" and small.key == big.key
+    clock = small.name in CLOCK and big.name in CLOCK
+    lag = small.name in LAG and big.name in LAG and small.name != big.name
+    scale = small.name in LASER_SCALE and big.name in LASER_SCALE
+    if grown or clock or lag or scale or (small.name in SHAPE and big.name in SHAPE and _together(small.key, big.key)):
+        return KIN_SHARE
+    if small.name in SCATTER and not big_is_scatter:
+        return SCATTER_SHARE if big.name in ROUGH else SMOOTH_SHARE
+    return RESIDUE_SHARE
+
+
+def _together(a: str, b: str) -> bool:
+    """Whether two keys (EYX or X) share the moving axis or the deviating direction; an empty key (ram sag) shares with all."""
+    if not a or not b or a[-1] == b[-1]:
+        return True
+    directions = [key[1] for key in (a, b) if len(key) == 3 and key[1] in "XYZ"]
+    return len(directions) == 2 and directions[0] == directions[1]
+
+
+def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[str]) -> dict[str, str]:
+    """Find names that score nothing once the residues are taken out of the fit, and give the reason by label.
+
+    Such a name only repairs what a residue spoils in other runs: three axes that seem to grow instead of the ball-bar shift the scale of
+    the laser, too. ``residue``: labels of the findings that are residues.
+    """
+    kept = [f for f in found if f.pick.label not in residue]
+    if not residue or len(kept) < 2:
+        return {}
+    out = {}
+    for f in kept:
+        rows = rows_for(problem, [g.pick for g in kept if g is not f])
+        if not f.pick.unnamed and gain_of(problem, f.pick, rows) <= f.gain - f.score:  # the price
+            out[f.pick.label] = f"evidence {f.score / 2.0:.0f}, but none without {', '.join(sorted(residue))}, not named either"
+    return out
+
+
+def companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
+    """Map the index of each finding that is only a residue to the index of the finding of which it is a residue."""
+    power = []
+    for pick, c in zip(solved.picks, solved.coefficients, strict=True):
+        size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2
+        power.append(np.sqrt(size / max(size.sum(), 1e-300)))
+    out: dict[int, int] = {}
+    for i, small in enumerate(found):
+        for j, big in enumerate(found):
+            if small.score < COMPANION_SHARE * big.score and not big.pick.unnamed and power[i] @ power[j] > COMPANION_OVERLAP:
+                out[i] = j
+    return out
