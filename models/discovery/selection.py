@@ -309,8 +309,9 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
 def merged(contest: Contest, picks: list[Pick]) -> list[Pick]:
     """Replace two picks by one name that scores higher than both together.
 
-    One effect of the true form can look like two of the textbook form: a lag of Y like equal leads of X and Z, a bed that bends double like
-    two curves. So the one name is compared with its forms (`Form`). Two structures without a name are not replaced.
+    One effect of the true form can look like two of the textbook form: a lag of Y like equal leads of X and Z, a bed that bends double
+    like two curves. So the one name is compared with its forms (`Form`). An effect that is tried only beside another one replaces nothing,
+    and two structures without a name are not replaced.
     """
     problem = contest.problem
     for i, j in combinations(range(len(picks)), 2):
@@ -322,7 +323,7 @@ def merged(contest: Contest, picks: list[Pick]) -> list[Pick]:
         both = gain_of(problem, a, rows) + gain_of(problem, b, rows_for(problem, [*rest, a]))
         tried = []
         for f in contest.shortlist(rows, [p.label for p in rest], TRIED):
-            if not f.pick.unnamed and f.gain > LIKE * both:
+            if not f.pick.unnamed and not f.pick.effect.beside and f.gain > LIKE * both:
                 one, gain = refined(problem, f.pick, rows)
                 one, _, _ = _formed(contest, one, rows, gain)
                 one, gain = refined(problem, one, rows, sweeps=1)  # the forms move the best pitch or time constant
