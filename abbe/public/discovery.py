@@ -29,6 +29,8 @@ class DiscoveryAnswer:
     ----------
     verdict : str
         ``"named"``, ``"none"`` (measurement and simulation agree), or ``"unknown"`` (the catalogue does not explain the difference).
+    proved : bool
+        Whether runs that were never fitted confirm the named effects.
     effects : dict
         Signed strength with standard uncertainty by label, e.g. ``"backlash:X"``.
     gap : dict
@@ -39,6 +41,7 @@ class DiscoveryAnswer:
     """
 
     verdict: str
+    proved: bool
     effects: dict[str, Estimate]
     gap: dict[str, dict[str, float]]
     next_measurement: dict[str, Any] | None
@@ -85,7 +88,7 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     found = {e.label: Estimate(e.strength, e.u_strength, unit(e.unit), "observed") for e in finding.effects}
     gap = {role: asdict(one) for role, one in finding.gaps.items()}
     following = None if finding.next_test is None else asdict(finding.next_test)
-    return DiscoveryAnswer(finding.verdict, found, gap, following, job, journal, finding)
+    return DiscoveryAnswer(finding.verdict, finding.proved, found, gap, following, job, journal, finding)
 
 
 def _silent(_: Progress) -> None:

@@ -162,7 +162,7 @@ def print_result(out: Console, result: DemoResult) -> None:
     """Print before and after as a table, then the verdict."""
     from rich.table import Table
 
-    from abbe.service.demo.demo_report import summary_rows, table_factor
+    from abbe.service.demo.demo_report import DIAGONALS_TOLD, summary_rows, table_factor
 
     table = Table(title=f"Simulated machine {result.seed}: before and after")
     for name in ("figure", "before", "after", "factor", "source"):
@@ -175,6 +175,7 @@ def print_result(out: Console, result: DemoResult) -> None:
         )
     out.print(table)
     best, share = result.truths[0].best_nine_tables_rms_um, 100 * table_factor(result).share
+    out.print(DIAGONALS_TOLD)
     out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their improvement factor was reached")
     decision = result.corrected.decision
     out.print(("kept: " if decision.keep else "rolled back: ") + decision.text)

@@ -33,11 +33,15 @@ from abbe.service.report.solution_sections import contributions, parameter_rows,
 from abbe.service.verification.verify import VerificationFigures
 
 TRUTH: Literal["sealed truth of the simulator"] = "sealed truth of the simulator"
+DIAGONALS_TOLD = (
+    "A measured body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. It begins 10 mm inside the "
+    "strokes and leaves out its far end, which the machine reaches one way only; so it is smaller than from corner to corner."
+)
 ALL_OBSERVABLE = (
     "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"
 )
 TRUTH_TITLES = {
-    "max_body_diagonal_um": "Largest body diagonal",
+    "max_body_diagonal_um": "Largest body diagonal, corner to corner",
     "volumetric_rms_um": "Volumetric error, rms",
     "volumetric_max_um": "Volumetric error, maximum",
 }
@@ -152,7 +156,7 @@ def _before_and_after(result: DemoResult, c: Correction) -> list[Block]:
         summary_table(summary_rows(result)),
         f"± is the expanded uncertainty U = k·u with k = {tidy(COVERAGE)} (about 95 %). A figure without ± has no stated uncertainty. "
         "Volumetric figures: best-fit rigid motion removed. “Sealed truth” rows come from the simulator's own error functions; the "
-        "measurement never saw them.",
+        f"measurement never saw them. {DIAGONALS_TOLD}",
         *([PictureBlock(caption, vectors)] if vectors else []),
         PictureBlock(diagonals, [diagonal_plot(_curves(c.before), _curves(c.after))], "wide"),
     ]

@@ -56,7 +56,11 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
         return "bad", "Something is missing that the catalogue does not explain", f"{_capital(gap)}. {there}.{beside}"
     judged = judge(finding)
     proof = _proof_text(judged) if judged.proved else f"{judged.rule}{_left_out_text(finding)}"
-    word = "Found" if not finding.confounded_with else "Found, but these runs cannot tell it from something else"
+    word = "Found"
+    if judged.proved is None and entering(finding):
+        word = "Found, not proved"
+    if finding.confounded_with:
+        word = "Found, but these runs cannot tell it from something else"
     left = _remainder_text(finding)
     sign = "ok" if word == "Found" and not left else "open"
     return sign, word, f"{names}. {_capital(gap)}; {proof}.{left}"
