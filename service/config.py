@@ -237,6 +237,12 @@ def _config_error(path: Path, errors: list[Mistake], environment: Mapping[str, A
     if first.unknown_key:
         hint = nearest(str(location[-1]), _siblings(location))
         return ConfigError(f"{source}: unknown key {key!r}{tail}", hint)
+    missing = [location_text(one.place) for one in errors if one.kind == "missing" and one.place[:-1] == location[:-1]]
+    if first.kind == "missing" and len(missing) > 1:
+        names = ", ".join(repr(one) for one in missing)
+        return ConfigError(
+            f"{source}: keys {names} are missing{and_more(errors[len(missing) - 1 :])}", "add them; `abbe schema` describes every key"
+        )
     if first.kind == "missing":
         return ConfigError(f"{source}: key {key!r} is missing{tail}", f"add {location[-1]} = ...")
     wanted = first.expected.replace("expected an object", "expected a table of keys")

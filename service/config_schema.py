@@ -59,7 +59,7 @@ Certificate = Annotated[date | None, AfterValidator(_certificate)]
 
 
 class AxisIntervals(ConfigTable):
-    """One interval of commanded coordinates for each axis, mm."""
+    """One interval of commanded coordinates for each axis, mm, e.g. ``{X = [0, 600], Y = [0, 500], Z = [0, 450]}``."""
 
     X: Interval
     Y: Interval

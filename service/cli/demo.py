@@ -100,7 +100,7 @@ def hidden_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> No
         for line in summary_lines(result):
             typer.echo(line)
     Console(stderr=True).print(f"report: {report}")
-    conclude("abbe demo --hidden 4" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
+    conclude("abbe demo --serve" if keep is None else f"abbe runs --db sqlite:///{folder / 'abbe.sqlite3'}", as_json=as_json)
 
 
 def artefact_demo(seed: int, speed: float, as_json: bool, keep: Path | None) -> None:

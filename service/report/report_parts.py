@@ -91,7 +91,7 @@ def conditions(runs: Sequence[Run], rules: Rules) -> tuple[dict[str, str], list[
                 if min(read) < low or max(read) > high:
                     remarks.append(f"the air was outside the allowed {low:g} to {high:g} °C: the figures cannot be judged")
     if not any(name.startswith("temp") and values.size for columns in further for name, values in columns.items()):
-        remarks.append("no temperature is on record")
+        remarks.append("no run records a temperature")
     feeds = [float(v) for r in runs for v in r.columns.feed_mm_min if v > 0.0]  # 0: not known
     if feeds:
         out["Feed"] = f"{min(feeds):.0f} to {max(feeds):.0f} mm/min" if min(feeds) != max(feeds) else f"{feeds[0]:.0f} mm/min"

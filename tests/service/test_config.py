@@ -126,6 +126,7 @@ BAD = [
     ("X = [0, 600]", "X = [600, 0]", r"stroke_mm.X: expected \[smaller, larger\], got \[600.0, 0.0\]"),
     ("X = [0, 600]", "X = [0]", "stroke_mm.X"),
     ("X = [0, 600]", "", "key 'stroke_mm.X' is missing"),
+    ("X = [0, 600]\nY = [0, 500]", "", "keys 'stroke_mm.X', 'stroke_mm.Y' are missing"),
     ("X = [0, 600]", "X = [0, inf]", r"stroke_mm.X\[2\]: expected a finite number"),
     ("table_change_um = 50", "table_chang_um = 50", "unknown key 'limits.table_chang_um' - did you mean 'table_change_um'?"),
     ("table_change_um = 50", "table_change_um = -1", "limits.table_change_um: expected .*greater than 0, got -1"),

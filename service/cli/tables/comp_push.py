@@ -217,7 +217,9 @@ def commission(
     elif found is not None:
         _show_proof(found)
     proved = levels.capabilities.level == (1 if one_bank else 3) and (found is None or found.proof.proved)
-    conclude("abbe runs" if proved and not levels_only else "abbe comp commission", machine=machine, as_json=as_json)
+    conclude(
+        "abbe measure --recipe identification" if proved and not levels_only else "abbe comp commission", machine=machine, as_json=as_json
+    )
     raise typer.Exit(0 if proved else 1)
 
 
