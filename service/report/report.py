@@ -122,7 +122,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
         remarks=[*table.remarks, *evaluated.remarks, *remarks],
         statements=[parts.VERIFICATION_STATEMENT, *evaluated.statements],
         provenance=parts.provenance(parts.data_digest(runs) if runs else parts.doc_digest(record.doc)),
-        appendix=picture_section(evaluated.pictures),
+        appendix=[*picture_section(evaluated.pictures), *evaluated.targets],
     )
     return with_later_changes(document, store, machine.name, str(record.doc.get("started_utc") or record.utc), runs)
 

@@ -174,6 +174,7 @@ def campaign_report(found: Measured, rules: Rules) -> Document:
         sections=_sections(found.solution),
         appendix=[
             *picture_section([*solved.pictures, *evaluated.pictures]),
+            *evaluated.targets,
             *_residuals(found.solution),
             *_budget(found.solution),
             Section("Runs", [_run_table(found)]),
@@ -203,6 +204,7 @@ def run_report(found: Measured, label: str, rules: Rules) -> Document:
         provenance=parts.provenance(parts.data_digest([run])),
         appendix=[
             *picture_section([*evaluated.pictures, *own.pictures]),
+            *evaluated.targets,
             Section("Set-up", [TextTable(("Name", "Value"), setup)]),
         ],
     )

@@ -16,9 +16,9 @@ from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.domain.machine import AxisMaterial
 from abbe.service.domain.run import Run
-from abbe.service.rendering.document import PictureBlock, ReportFigure
+from abbe.service.rendering.document import PictureBlock, ReportFigure, Section, TextTable
 from abbe.service.rendering.model import PolarTrace
-from abbe.service.rendering.numbers import plain
+from abbe.service.rendering.numbers import plain, tidy
 from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.runs.coverage import not_judged
@@ -53,11 +53,13 @@ BAR_STATEMENT = (
 class Evaluated:
     """Results of evaluated runs for a report.
 
-    ``statements`` are part of the uncertainty statement; ``conditions`` state for each test how it was reduced to 20 °C.
+    ``targets``: deviations at each position of a test; ``statements`` are part of the uncertainty statement; ``conditions`` state for each
+    test how it was reduced to 20 °C.
     """
 
     figures: list[ReportFigure] = field(default_factory=list)
     pictures: list[PictureBlock] = field(default_factory=list)
+    targets: list[Section] = field(default_factory=list)
     remarks: list[str] = field(default_factory=list)
     not_observable: list[str] = field(default_factory=list)
     statements: list[str] = field(default_factory=list)
@@ -65,7 +67,7 @@ class Evaluated:
 
     def add(self, other: Evaluated) -> None:
         """Append the results of ``other``."""
-        for one in ("figures", "pictures", "remarks", "not_observable", "statements"):
+        for one in ("figures", "pictures", "targets", "remarks", "not_observable", "statements"):
             getattr(self, one).extend(getattr(other, one))
         self.conditions.update(other.conditions)
 
@@ -136,6 +138,7 @@ def _axis_ways(out: Evaluated, test: AxisTest, stated: tuple[ScaleBudget, Stated
         group = f"Axis {test.name}, set-up {test.setup}: positioning{way.text}"
         out.figures += [_figure(group, *row, way.method) for row in positioning_rows(one)]
         out.pictures.append(_positioning(f"{label}{_short(way)}", f"position of {test.name} in mm", one))
+        out.targets.append(Section(f"Deviation at each position: {label}{_short(way)}", [_target_table(one)]))
         found.append(one)
     return found[0]
 
@@ -173,6 +176,17 @@ def _figure(group: str, symbol: str, name: str, value: Value | None, method: str
     if value is None:
         return ReportFigure(group, symbol, name, None, None, "µm", method)
     return ReportFigure(group, symbol, name, value.value_mm * UM, value.u_mm * UM, "µm", method)
+
+
+def _target_table(p: Positioning) -> TextTable:
+    """Mean deviations of both directions, their mean, reversal and standard deviations at each position, as ISO 230-2 lists them."""
+    head: tuple[str, ...] = ("Position, mm", "Mean +, µm", "Mean -, µm", "Mean, µm", "Reversal B, µm")
+    columns = [p.mean_forward_mm, p.mean_backward_mm, p.mean_mm, p.reversal_mm]
+    if p.s_forward_mm is not None and p.s_backward_mm is not None:
+        head = (*head, "s +, µm", "s -, µm")
+        columns += [p.s_forward_mm, p.s_backward_mm]
+    places = (tidy(float(one)) for one in p.position_mm)
+    return TextTable(head, [[place, *(plain(float(one) * UM) for one in row)] for place, *row in zip(places, *columns, strict=True)])
 
 
 def _positioning(label: str, x_label: str, p: Positioning) -> PictureBlock:

@@ -77,6 +77,12 @@ def test_both_values_and_both_uncertainties_in_micrometres() -> None:
         assert figures(told, "at 20 °C, ISO 230-2", symbol) == [wanted], symbol
     twice = evaluate([line()], None, {"X": AxisMaterial(23e-6, 0.6e-6, 24.0, 0.1, 0.0)})
     assert figures(twice, "at 20 °C, ISO 230-2") == [(pytest.approx(46.0), pytest.approx(np.sqrt(2.3**2 + 2.4**2 + 0.3**2)))]
+    assert [section.title for section in told.targets] == [
+        "Deviation at each position: X L at 20 °C", "Deviation at each position: X L as measured"
+    ]  # fmt: skip
+    (reduced,), (measured,) = (section.blocks for section in told.targets)
+    assert [row[0] for row in measured.rows] == [row[0] for row in reduced.rows]
+    assert measured.rows[-1][:5] == ["1000", "46.0", "46.0", "46.0", "0"]
     assert REDUCTION_STATEMENT in told.statements
     assert told.conditions[f"{AT_20}, axis X L"].startswith("reduced from 24.00 ± 0.40 °C (stated in the machine file) with 11.5 ± 1.2 µm")
 
