@@ -104,8 +104,8 @@ def shared() -> Path:
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[Callable[[], str]]:
-    """Make throw-away databases on a real PostgreSQL; gives their URLs."""
+def _postgres_server() -> Iterator[tuple[Any, list[str], list[str]]]:
+    """A connection to a real PostgreSQL, the names of the databases made on it, and of those that are empty and free."""
     psycopg = pytest.importorskip("psycopg")
     try:
         server = psycopg.connect(POSTGRES, autocommit=True, connect_timeout=3)
@@ -113,18 +113,35 @@ def postgres() -> Iterator[Callable[[], str]]:
         _require("postgresql", False, f"no PostgreSQL at {POSTGRES}")
         return
     made: list[str] = []
-
-    def make() -> str:
-        name = f"abbe_test_{uuid.uuid4().hex}"
-        server.execute(f"CREATE DATABASE {name}")
-        server.execute(f"ALTER DATABASE {name} SET synchronous_commit = off")  # as above: no test cuts this server's power
-        made.append(name)
-        return POSTGRES + name
-
-    yield make
+    yield server, made, []
     for name in made:
         server.execute(f"DROP DATABASE {name} WITH (FORCE)")
     server.close()
+
+
+@pytest.fixture
+def postgres(_postgres_server: tuple[Any, list[str], list[str]]) -> Iterator[Callable[[], str]]:
+    """Give URLs of empty databases. A test's databases are emptied for the next test: before a drop the server writes all its pages."""
+    server, made, free = _postgres_server
+    taken: list[str] = []
+
+    def make() -> str:
+        name = free.pop() if free else f"abbe_test_{uuid.uuid4().hex}"
+        taken.append(name)
+        if name not in made:
+            server.execute(f"CREATE DATABASE {name}")
+            made.append(name)
+        server.execute(f"ALTER DATABASE {name} SET synchronous_commit = off")  # as above: no test cuts this server's power
+        return POSTGRES + name
+
+    yield make
+    for name in taken:
+        server.execute(f"ALTER DATABASE {name} RESET ALL")
+        server.execute("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", (name,))
+        with type(server).connect(POSTGRES + name, autocommit=True) as inside:
+            inside.execute("DROP SCHEMA public CASCADE")
+            inside.execute("CREATE SCHEMA public")
+        free.append(name)
 
 
 # --- asyncio tasks -------------------------------------------------------------------------------------------------------------------

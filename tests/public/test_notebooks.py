@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import subprocess
 import sys
@@ -19,6 +20,8 @@ SHOWN = {
     "own-effect": (r"<abbe.Answer: unknown, no effect>", r"<abbe.Answer: named, clamp_step> (5\.9\d*|6|6\.\d+) "),
 }
 """What each prints, in this order."""
+LONG = pytest.mark.skipif(os.environ.get("ABBE_TEST_LONG") != "1", reason="two whole searches (ABBE_TEST_LONG=1); as test_public does")
+PLAYED = [pytest.param(name, marks=LONG if name == "own-effect" else ()) for name in SHOWN]
 
 
 def code(name: str) -> list[str]:
@@ -33,7 +36,7 @@ def test_each_notebook_is_here_without_outputs() -> None:
         assert [cell for cell in cells if cell.get("outputs") or cell.get("execution_count")] == []
 
 
-@pytest.mark.parametrize("name", SHOWN)
+@pytest.mark.parametrize("name", PLAYED)
 @pytest.mark.timeout(400)
 def test_it_runs_beside_a_foreign_models_py(name: str, tmp_path: Path) -> None:
     for foreign in ("models.py", "service.py", "drivers.py", "simulators.py"):

@@ -19,7 +19,7 @@ from playwright.sync_api import Browser, Page
 
 from tests.box_font import box_font
 from tests.pages_world import Filled, Served, filled_once, served
-from tests.system.test_serve_screens import SIZES, log_in
+from tests.system.test_serve_screens import LONG, SIZES, log_in
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(400)]
 FOLDER = Path(__file__).parent / "layouts"
@@ -60,7 +60,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield one
 
 
-@pytest.fixture(scope="module", params=SIZES)
+@pytest.fixture(scope="module", params=SIZES if LONG or RENEW else ("1280", "390"))
 def page(request: pytest.FixtureRequest, chromium: Browser, running: Served) -> Iterator[Page]:
     """A browser of one size whose every font is the same; the page's policy would refuse the font."""
     size: Any = SIZES[request.param]

@@ -20,11 +20,15 @@ from abbe.service.storage.store import Store
 from tests.conftest import ROOT
 from tests.pages_world import Filled, filled_once, served
 from tests.service.rendering.test_certificate import ITEM, LABORATORY
-from tests.system.test_serve_screens import log_in
+from tests.system.test_serve_screens import LONG, log_in
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(900)]
 FOLDER = os.environ.get("ABBE_PICTURES")
 """Where `make pictures` wants them; without it they go to a scratch folder and are looked at there."""
+BY_HAND = pytest.mark.skipif(
+    not (FOLDER or LONG),
+    reason="test_layouts and test_serve_screens walk the screens: ABBE_TEST_LONG=1 or `make pictures` takes them",
+)
 WIDE = 1100
 SCREENS = {
     "home": ("/", 760),
@@ -63,6 +67,7 @@ def kept(page: Page, name: str, folder: Path, height: int, begins: Locator | Non
     assert 10_000 < target.stat().st_size < 150_000, name
 
 
+@BY_HAND
 def test_the_screens(page: Page, filled: Filled, tmp_path: Path) -> None:
     with served(filled) as running:
         log_in(page, running.base, "anna")
@@ -74,6 +79,7 @@ def test_the_screens(page: Page, filled: Filled, tmp_path: Path) -> None:
             kept(page, name, tmp_path, height, page.locator("canvas") if name == "volume" else None)
 
 
+@BY_HAND
 def test_the_report_of_a_solution(page: Page, filled: Filled, tmp_path: Path) -> None:
     report = tmp_path / "june.html"
     abbe("solve", filled.campaign, "--db", filled.url, "--report", report)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import socket
 import time
 from collections.abc import Callable, Iterator
@@ -35,6 +36,10 @@ def sections(broker: Broker, port: int, cron: str) -> list[str]:
     return ["[mqtt]", f'url = "{broker.url}"', 'topic_prefix = "plant/abbe"', "[web]", f"port = {port}", *timetable]
 
 
+@pytest.mark.skipif(
+    os.environ.get("ABBE_TEST_LONG") != "1",
+    reason="its parts: test_serve_mqtt, test_serve_page, test_serve_processes; ABBE_TEST_LONG=1 plays the whole",
+)
 def test_two_scheduled_checks_and_a_broker_that_dies(tmp_path: Path, ending: ExitStack) -> None:
     port, started_s = free_port(), time.monotonic()
     broker = Broker(tmp_path)

@@ -32,7 +32,7 @@ pytestmark = [pytest.mark.browser, pytest.mark.timeout(240)]
 RECIPE = "verify"
 STEPS = ["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
 WALKS = [(size, scheme, lang) for size in SIZES for scheme in ("light", "dark") for lang in ("en", "ja")]
-SHORT = [("390", "light", "en"), ("1024", "dark", "ja")]
+SHORT = [("390", "light", "en")]
 
 
 def check(store: Store, filled: Filled, at: datetime, um: float) -> int:

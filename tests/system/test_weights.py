@@ -16,7 +16,7 @@ from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.storage.store import Store
 from tests.built_once import once_per_run
 from tests.pages_world import Filled, Served, fill, screens, served
-from tests.system.test_serve_screens import MAP_READY, log_in
+from tests.system.test_serve_screens import LONG, MAP_READY, log_in
 
 pytestmark = [pytest.mark.browser, pytest.mark.timeout(400)]
 HEAVIEST = 150_000
@@ -84,6 +84,7 @@ def weighed(page: Page, scales: Scales, address: str) -> int:
     return round(scales.bytes)
 
 
+@pytest.mark.skipif(not LONG, reason="a store of a year: ABBE_TEST_LONG=1 fills and weighs it")
 def test_every_screen_is_light_over_a_store_of_a_year(chromium: Browser, running: Served) -> None:
     with closing(chromium.new_context(service_workers="block", locale="ja")) as context:
         page = context.new_page()
