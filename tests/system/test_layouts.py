@@ -60,6 +60,7 @@ def running(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Served]:
         yield one
 
 
+# ABBE_TEST_LONG=1 compares the third size, too.
 @pytest.fixture(scope="module", params=SIZES if LONG or RENEW else ("1280", "390"))
 def page(request: pytest.FixtureRequest, chromium: Browser, running: Served) -> Iterator[Page]:
     """A browser of one size whose every font is the same; the page's policy would refuse the font."""
