@@ -19,10 +19,10 @@ SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", 
 """Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
 this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
 less like scatter. A true stick-slip had 1.0 % of a pitch error."""
-AXIS_SHARE = 0.02
+AXIS_SHARE = 0.01
 AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect
-is a residue of the other."""
+is a residue of the other. In 52 cases, residues had at most 0.1 %; two true spikes had 1.5 % and, with three times its height, 0.6 %."""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.03
@@ -61,7 +61,7 @@ def residues(
 
     - 0.1 % of that of any stronger effect;
     - for stick-slip and vibration: 1 % of that of an effect at reversals or a cyclic error, 0.3 % of that of another mean effect;
-    - 2 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
+    - 1 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
       mismatch);
     - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
       positioning and thermal growth of the same axis), another lag of the drives, another scale of the laser.

@@ -38,11 +38,11 @@ def answered(named: NamedEffect) -> dict[str, Any]:
 @pytest.mark.parametrize(
     ("strong", "weak", "share", "residue"),
     [
-        ("backlash:Z", "reversal_spike:Z", 0.014, True),
-        ("backlash:Z", "reversal_spike:Z", 0.03, False),
-        ("backlash:Z", "reversal_spike:X", 0.009, False),
-        ("reversal_spike:X", "lateral_play:EYX", 0.015, True),
-        ("reversal_spike:X", "lateral_play:EXY", 0.015, False),
+        ("backlash:Z", "reversal_spike:Z", 0.008, True),
+        ("backlash:Z", "reversal_spike:Z", 0.014, False),
+        ("backlash:Z", "reversal_spike:X", 0.008, False),
+        ("reversal_spike:X", "lateral_play:EYX", 0.008, True),
+        ("reversal_spike:X", "lateral_play:EXY", 0.008, False),
         ("cyclic_error:Y", "stick_slip:X", 0.007, True),
         ("backlash:X", "vibration:Z", 0.003, True),
         ("backlash:X", "vibration:Z", 0.02, False),
