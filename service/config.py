@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import re
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -23,6 +22,7 @@ from abbe.service.domain.bounds import TEXT, WORD
 from abbe.service.domain.machine_file import MachineFileSummary, Origin, StatedValue
 from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.secrets import mask_secrets
+from abbe.service.toml_text import key_lines
 
 PREFIX = "ABBE_"
 
@@ -43,6 +43,11 @@ class LoadedMachine:
 
         return resolve_url(self.machine.store.url, self.path.resolve().parent)
 
+    @property
+    def sha256(self) -> str:
+        """Digest of the file as it was read."""
+        return hashlib.sha256(self.body).hexdigest()
+
     def values(self) -> list[tuple[str, Any, Origin]]:
         """List effective values as (dotted key, value with secrets masked, origin), in the order of the documentation."""
         found = _leaves(self.machine.model_dump(mode="json"))
@@ -50,12 +55,12 @@ class LoadedMachine:
 
     def summary(self) -> MachineFileSummary:
         """The values for the page, with their lines in the file as it was read."""
-        lines = key_lines(_text(self.body))
+        lines = key_lines(text_of(self.body))
         stated = tuple(
             StatedValue(key[:WORD], json.dumps(value, ensure_ascii=False)[:TEXT], origin, lines.get(key, 0) if origin == "file" else 0)
             for key, value, origin in self.values()
         )
-        return MachineFileSummary(str(self.path.resolve())[:TEXT], hashlib.sha256(self.body).hexdigest(), stated)
+        return MachineFileSummary(str(self.path.resolve())[:TEXT], self.sha256, stated)
 
 
 def load_machine(path: Path | str) -> LoadedMachine:
@@ -67,7 +72,12 @@ def load_machine(path: Path | str) -> LoadedMachine:
         Names file, key, and the expected value.
     """
     path = Path(path)
-    from_file, body = _read_toml(path, "machine file")
+    return parse_machine(path, _read(path, "machine file"))
+
+
+def parse_machine(path: Path, body: bytes) -> LoadedMachine:
+    """Check the bytes of a machine file that is, or is going to be, at ``path``. Raises ConfigError as `load_machine` does."""
+    from_file = _parsed(path, body, "machine file")
     from_environment = _overrides()
     merged = _merged(from_file, from_environment)
     try:
@@ -108,17 +118,21 @@ def read_toml(path: Path, what: str = "machine file") -> dict[str, Any]:
     ConfigError
         The file is missing, unreadable, not UTF-8 or not TOML; the message says which.
     """
-    return _read_toml(path, what)[0]
+    return _parsed(path, _read(path, what), what)
 
 
-def _read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
+def _read(path: Path, what: str) -> bytes:
     try:
-        body = path.read_bytes()
-        return tomllib.loads(_text(body)), body
+        return path.read_bytes()
     except FileNotFoundError:
         raise ConfigError(f"{what} {path} does not exist", "give the path of a machine file, e.g. deploy/machine.toml") from None
     except OSError as err:
         raise ConfigError(f"{what} {path} cannot be read: {err.strerror}", "give a readable TOML file") from None
+
+
+def _parsed(path: Path, body: bytes, what: str) -> dict[str, Any]:
+    try:
+        return tomllib.loads(text_of(body))
     except UnicodeDecodeError:
         raise ConfigError(f"{what} {path} is not UTF-8 text", "save it as UTF-8") from None
     except tomllib.TOMLDecodeError as err:
@@ -129,54 +143,9 @@ def _read_toml(path: Path, what: str) -> tuple[dict[str, Any], bytes]:
         raise ConfigError(f"{path}: an integer has thousands of digits", "correct the file") from None
 
 
-def _text(body: bytes) -> str:
+def text_of(body: bytes) -> str:
     """Return the text of a file with line feeds as its only line ends. Raises UnicodeDecodeError."""
     return body.decode("utf-8").replace("\r\n", "\n").replace("\r", "\n")
-
-
-_TOKEN = re.compile(r"""\"{3}(?:\\.|[^\\])*?\"{3,5}|'{3}.*?'{3,5}|"(?:\\.|[^"\\\n])*"|'[^'\n]*'|\#[^\n]*|[\[{]|[\]}]|\n""", re.DOTALL)
-"""Parts of a TOML text that decide where a statement ends: strings, comments, brackets, ends of lines."""
-
-
-def key_lines(text: str) -> dict[str, int]:
-    """Number of the line, from 1, on which each key of a valid TOML text (lines end with ``\\n``) begins."""
-    found: dict[str, int] = {}
-    tables: dict[str, int] = {}  # how many tables of a list there are so far
-    prefix = ""
-    for line, statement in _statements(text):
-        values = tomllib.loads(statement)
-        if statement.lstrip(" \t").startswith("["):
-            prefix = _header(values, tables)
-        else:
-            found |= {key: line for key, _ in _leaves(values, prefix)}
-    return found
-
-
-def _statements(text: str) -> Iterator[tuple[int, str]]:
-    """Yield each header, each key with its value, each comment and each empty line, with the number of its first line."""
-    line, begun, start, depth = 1, 1, 0, 0
-    for token in _TOKEN.finditer(text):
-        found = token[0]
-        depth += (found in "[{") - (found in "]}")
-        line += found.count("\n")
-        if found == "\n" and depth == 0:
-            yield begun, text[start : token.start()]
-            begun, start = line, token.end()
-    yield begun, text[start:]
-
-
-def _header(values: Mapping[str, Any], tables: dict[str, int]) -> str:
-    """Prefix of the keys below a header; a further table of a list is counted in ``tables``."""
-    prefix, inside = "", values
-    while inside:
-        ((key, found),) = inside.items()
-        prefix += key
-        if isinstance(found, list):
-            tables[prefix] = tables.get(prefix, 0) + 1
-            found = found[0]
-        prefix += f"[{tables[prefix]}]." if prefix in tables else "."
-        inside = found
-    return prefix
 
 
 def _overrides() -> dict[str, Any]:

@@ -1,10 +1,11 @@
-"""Read files from outside Abbe (plain files only, up to a size limit), and lock Abbe's own files."""
+"""Read files from outside Abbe (plain files only, up to a size limit), replace a file at once, and lock Abbe's own files."""
 
 from __future__ import annotations
 
 import errno
 import os
 import stat
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -88,6 +89,40 @@ def read_plain(path: Path, most: int) -> bytes:
 def is_plain(path: Path) -> bool:
     """Return whether a path is itself a plain file or folder, not a link to one."""
     return stat.S_IFMT(os.lstat(path).st_mode) in {stat.S_IFREG, stat.S_IFDIR}
+
+
+def replace_file(path: Path, body: bytes) -> None:
+    """Replace a file at once and for good: after a power cut it is the old or the new one. Its rights, and where possible its owner, stay.
+
+    A link stays a link: the file that it leads to is replaced. Raises OSError: the old file is untouched.
+    """
+    target = path.resolve()
+    known = target.stat()
+    beside = target.with_name(f".{target.name}.new")
+    try:
+        with beside.open("wb") as file:
+            os.fchmod(file.fileno(), known.st_mode & 0o7777)
+            with suppress(OSError):  # only root gives a file to another owner
+                os.fchown(file.fileno(), -1, known.st_gid)
+                os.fchown(file.fileno(), known.st_uid, -1)
+            file.write(body)
+            file.flush()
+            os.fsync(file.fileno())
+        beside.replace(target)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink()
+        raise
+    folder = os.open(target.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def may_replace(path: Path) -> bool:
+    """Return whether this process could replace a file now."""
+    return os.access(path.resolve().parent, os.W_OK)
 
 
 def _without_waiting(path: str, flags: int) -> int:

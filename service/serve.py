@@ -27,6 +27,7 @@ from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.channel.messages import PROTOCOL, Begin
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.core.board import Board, BoardWatch, SnapshotSource, StatePublisher, VerifiedWatch
+from abbe.service.core.file_changes import FileChangeContext, FileChanges
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders, full_campaigns, may
 from abbe.service.core.push_recovery import PushRecovery, push_is_open
@@ -114,11 +115,30 @@ class Service:
         snapshots = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
         orders = Orders(store, clock, self._jobs, context, OrderActions() if setup.actions is None else setup.actions(store))
         begin = self._begin((*recipes, *self._jobs.full.names))
+        self.following: ServiceSetup | None = None
+        """The setup with which the service starts anew after `run`; None: it ends."""
+        self._end = asyncio.Event()
         self._web = WebProcess(begin, listening, snapshots.now, self._jobs, clock, setup.live, orders)
+        self._web.files = None if setup.source is None else FileChanges(setup.source, self._file_changes(book))
         self._opcua = self._make_opcua()
         doc = {"host": setup.web.host, "port": listening.getsockname()[1]}
         doc |= {} if setup.stated is None else {"machine_file": setup.stated.path, "sha256": setup.stated.sha256}
         book.write(AuditEvent(who=this_account(), action="abbe serve", target=setup.machine, outcome="begun", doc=doc))
+
+    def _file_changes(self, book: AuditBook) -> FileChangeContext:
+        setup, store = self._setup, self._store
+
+        def restart(following: ServiceSetup) -> None:
+            self.following = following
+            self._end.set()
+
+        return FileChangeContext(
+            lambda who, need: asyncio.to_thread(may, store, who, need),
+            book,
+            lambda: self._jobs.claim,
+            partial(push_is_open, store, setup.machine, setup.control),
+            restart,
+        )
 
     def _begin(self, recipes: tuple[str, ...]) -> Begin:
         setup = self._setup
@@ -181,24 +201,28 @@ class Service:
             self._publisher.wake()
 
     async def run(self, stop: asyncio.Event, *, once: bool) -> bool:
-        """Work until ``stop``, or, with ``once``, until every recipe has run once; return whether all of those passed."""
-        passed = True
+        """Work until ``stop``, a changed machine file, or, with ``once``, until every recipe has run once; return whether all of those
+        passed."""
+        passed, end = True, self._end
         if self._opcua is not None:
             await self._opcua.prepare()
         async with asyncio.TaskGroup() as parts:
-            mqtt = parts.create_task(self._publisher.run() if self._publisher is not None else stop.wait(), name="mqtt")
+            mqtt = parts.create_task(self._publisher.run() if self._publisher is not None else end.wait(), name="mqtt")
             parts.create_task(self._web.run(), name="web")
             work = parts.create_task(self._once() if once else self._timetable(parts), name="scheduler")
             beat = parts.create_task(self._heartbeat(), name="heartbeat")
-            opcua = parts.create_task(self._opcua.run(stop) if self._opcua is not None else stop.wait(), name="opcua")
+            opcua = parts.create_task(self._opcua.run(end) if self._opcua is not None else end.wait(), name="opcua")
             presence = parts.create_task(self._presence.run(), name="presence")
+            ended = parts.create_task(end.wait(), name="end")
             stopped = parts.create_task(stop.wait(), name="stop")
             try:
-                await asyncio.wait({work, stopped}, return_when=asyncio.FIRST_COMPLETED)
+                await asyncio.wait({work, stopped, ended}, return_when=asyncio.FIRST_COMPLETED)
             except asyncio.CancelledError:  # a part failed, and the group has cancelled this task and all others
                 self._ask_to_end()
                 raise
-            notify("STOPPING=1")
+            if self.following is None or stop.is_set():
+                notify("STOPPING=1")
+            end.set()
             if work.done() and not work.cancelled() and work.exception() is None:
                 passed = work.result()
             work.cancel()
@@ -207,7 +231,7 @@ class Service:
             self._ask_to_end()
             await asyncio.wait({mqtt}, timeout=GOODBYE_S)
             mqtt.cancel()  # a broker that accepts connections and never answers would delay the end
-            for task in (beat, stopped, opcua, presence):
+            for task in (beat, stopped, ended, opcua, presence):
                 task.cancel()
         return passed
 
@@ -310,22 +334,41 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
     check_certificate(setup.web.certificate, setup.web.key)
     listening = bind(setup.web.host, setup.web.port)
     try:
-        store = await asyncio.to_thread(Store.open, setup.store_url)
-        if warning := database_readable_by_others(setup.store_url):
-            log.warning("database", text=warning)
-        try:
-            host, port = listening.getsockname()[:2]
-            scheme = "https" if setup.web.certificate else "http"
-            for line in setup.warnings:
-                log.warning("machine file", text=line)
-            log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
-            open_push_readers.append(lambda: JournalView.read(store, setup.machine, setup.control).open_push)
-            return await Service(setup, store, listening, clock).run(stop, once=once)
-        finally:
-            await asyncio.to_thread(store.close)
-            log.info("stopped")
+        while True:
+            service, passed = await _live(setup, listening, clock, stop, open_push_readers, once=once)
+            if service.following is None or stop.is_set():
+                return passed
+            setup = service.following
+            log.info("starting anew with the changed machine file")
     finally:
         listening.close()
+
+
+async def _live(
+    setup: ServiceSetup,
+    listening: socket.socket,
+    clock: Clock,
+    stop: asyncio.Event,
+    open_push_readers: list[OpenPushReader],
+    *,
+    once: bool,
+) -> tuple[Service, bool]:
+    """Run the service until it ends or its machine file has changed; the socket stays open, so that browsers wait."""
+    store = await asyncio.to_thread(Store.open, setup.store_url)
+    if warning := database_readable_by_others(setup.store_url):
+        log.warning("database", text=warning)
+    try:
+        host, port = listening.getsockname()[:2]
+        scheme = "https" if setup.web.certificate else "http"
+        for line in setup.warnings:
+            log.warning("machine file", text=line)
+        log.info("serving", machine=setup.machine, page=f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/", store=store.url)
+        open_push_readers[:] = [lambda: JournalView.read(store, setup.machine, setup.control).open_push]
+        service = Service(setup, store, listening, clock)
+        return service, await service.run(stop, once=once)
+    finally:
+        await asyncio.to_thread(store.close)
+        log.info("stopped")
 
 
 def _admins(url: str) -> int:

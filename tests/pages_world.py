@@ -355,7 +355,7 @@ def screens(filled: Filled) -> list[str]:
     found += [f"/motions?id={filled.solution}", f"/motions?id={filled.solution}&motion=EXY", f"/motions?id={filled.solution}&motion=C0Y"]
     found += [f"/volume?id={filled.solution}", f"/volume?id={filled.solution}&motion=EYY&plane=XZ", f"/budget?id={filled.solution}"]
     found += [f"/whatif?id={filled.solution}&take=mean.C0Y&take=EYY", "/compare", "/compare?run=2&run=3"]
-    plant = ["/fleet", "/devices", "/settings"]
+    plant = ["/fleet", "/devices", "/settings", "/administration"]
     first = ["/", "/new", "/runs", *runs, "/results", "/discoveries", *found]
     alarms = ["/alarms", "/alarm?id=1", "/alarm?id=2", f"/check?id={filled.checks}", f"/check?id={filled.checks - 2}"]
     return [*first, *alarms, "/proposals", *proposals, "/table", "/trends", "/schedule", "/audit", *plant]

@@ -5,8 +5,9 @@ the parent created; it has no file, port or name to which another process could 
 
 The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSamples`,
 `LiveMachine`, `Answer`); the web process forwards what a person
-requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`). No request can name a device, a register or a file, or carry a
-table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it.
+requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`, `ChangeFile`). No request can name a device, a register or a file,
+or carry a table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it; a change
+of the machine file reaches those sections alone that `abbe.service.machine_changes.RIGHTS` lists.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 from abbe.service.domain.bounds import Number, Text, Word
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import MachineObject, Rules
-from abbe.service.domain.machine_file import MachineFileSummary
+from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
 from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
@@ -233,8 +234,22 @@ class PushNow(WebRequest):
     key: Word
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChangeFile(WebRequest):
+    """Change values of the machine file, and start anew with them; without ``edits``: only read the file again.
+
+    ``sha256``: digest of the file whose values the person saw; ``looser``: the person knows that a limit is loosened.
+    """
+
+    kind: Literal["file"] = "file"
+    sha256: Word
+    edits: Annotated[tuple[FileEdit, ...], Field(max_length=100)]
+    reason: Annotated[str, Field(max_length=500)]
+    looser: bool
+
+
 FromCore = Begin | Snapshot | Jobs | LivePath | LiveSamples | LiveMachine | Answer
-CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow
+CoreRequest = StartJob | SteerJob | ConfirmPrompt | RollBack | PushNow | ChangeFile
 """Requests that the core answers with an `Answer`."""
 FromWeb = Serving | WebHeartbeat | CoreRequest
 

@@ -9,6 +9,7 @@ from typing import Any
 from abbe.service.capture.live import LiveFeed
 from abbe.service.channel.messages import MachineSummary
 from abbe.service.clock import Clock
+from abbe.service.config import LoadedMachine
 from abbe.service.config_schema import OpcUa, Web
 from abbe.service.core.orders import MeasureCampaign, OrderActions
 from abbe.service.core.push_recovery import Recover
@@ -21,6 +22,14 @@ from abbe.service.scheduler.alarm_manager import Duties
 from abbe.service.scheduler.ports import Check, Readiness
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.storage.store import Store
+
+
+@dataclass(frozen=True, slots=True)
+class MachineFileSource:
+    """The machine file in force; ``prepare``: makes the setup of the service from a file, or refuses the file as a start would."""
+
+    loaded: LoadedMachine
+    prepare: Callable[[LoadedMachine], ServiceSetup]
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,6 +110,8 @@ class ServiceSetup:
     """The machine file, for the page that shows it."""
     warnings: tuple[str, ...] = ()
     """Unusual but possible values of the machine file: logged once the service is up."""
+    source: MachineFileSource | None = None
+    """The machine file, for changes on the page; None: the page changes no file."""
 
     @property
     def control(self) -> str:

@@ -21,6 +21,7 @@ from abbe.service.channel.messages import (
     PROTOCOL,
     Answer,
     Begin,
+    ChangeFile,
     ConfirmPrompt,
     CoreRequest,
     Jobs,
@@ -39,6 +40,7 @@ from abbe.service.channel.messages import (
 )
 from abbe.service.children import python_command
 from abbe.service.clock import Clock
+from abbe.service.core.file_changes import FileChanges
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import Orders
 from abbe.service.domain.progress import RecordedPath
@@ -167,6 +169,8 @@ class WebProcess:
         orders: Orders | None = None,
     ) -> None:
         self._live, self._orders = live, orders
+        self.files: FileChanges | None = None
+        """Changes the machine file; None: there is none."""
         self._begin, self._listening, self._snapshot, self._jobs, self._clock = begin, listening, snapshot, jobs, clock
         self.restarts = 0
         self._changed, self._ending = asyncio.Event(), asyncio.Event()
@@ -278,7 +282,7 @@ class WebProcess:
                         raise ChannelBroken(f"the web process speaks version {protocol} of the channel, the core {PROTOCOL}")
                     self._up = True
                     log.info("page up", restarts=self.restarts)
-                case StartJob() | SteerJob() | ConfirmPrompt() | RollBack() | PushNow():
+                case StartJob() | SteerJob() | ConfirmPrompt() | RollBack() | PushNow() | ChangeFile():
                     answer = await self._answered(message)
                     wire.send(Jobs("jobs", self._jobs.latest()))  # first: a client that gets a job's number can ask for it
                     wire.send(answer)
@@ -294,6 +298,10 @@ class WebProcess:
                     return await self._jobs.steer(message)
                 case ConfirmPrompt():
                     return await self._jobs.done_by_hand(message)
+                case ChangeFile():
+                    if self.files is None:
+                        return Answer("answer", message.request, "conflict", "this service was started without a machine file", "")
+                    return await self.files.change(message)
             if self._orders is None:
                 return Answer("answer", message.request, "conflict", "this service takes no orders for tables", "")
             return await (self._orders.rollback(message) if isinstance(message, RollBack) else self._orders.push(message))

@@ -1,4 +1,4 @@
-"""The values that the machine file states, with their lines, for the screen that shows them; the page cannot change them."""
+"""The values that the machine file states, with their lines, and changes of them that a person asks for."""
 
 from __future__ import annotations
 
@@ -24,6 +24,14 @@ class StatedValue:
     value: Text
     origin: Origin
     line: Number
+
+
+@dataclass(frozen=True, slots=True)
+class FileEdit:
+    """A wanted value. ``key``: dotted, tables of a list numbered from 1; ``value``: as JSON; ``null`` removes the key or table."""
+
+    key: Word
+    value: Text
 
 
 @dataclass(frozen=True, slots=True)

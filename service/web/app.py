@@ -39,6 +39,7 @@ from abbe.service.web.login.login import add_login
 from abbe.service.web.metrics import add_metrics
 from abbe.service.web.mtconnect import add_mtconnect
 from abbe.service.web.page import HERE, ICON, environment, render
+from abbe.service.web.pages.administration import add_administration
 from abbe.service.web.pages.alarms import add_alarm_pages
 from abbe.service.web.pages.check import add_check_page
 from abbe.service.web.pages.context import PageContext
@@ -146,7 +147,7 @@ def create_app(
         add_api(app, api)
     if auth is not None:
         add_login(app, environment(), auth)
-        context = _page_context(source, auth, api, pushes_itself=parts is not None and parts.pushes_itself)
+        context = _page_context(source, auth, api, parts)
         add_pages(app, context)
         add_alarm_pages(app, context)
         add_user_pages(app, context)
@@ -155,6 +156,7 @@ def create_app(
         add_new_page(app, context, parts.plans if parts is not None else Rehearsals())
         if api is not None:
             add_plant_screens(app, context, api)
+            add_administration(app, context, api.stated, None if parts is None else parts.core)
             add_table_screen(app, context)
     if parts is not None:
         add_jobs(app, parts.core, parts.recipes, parts.campaigns)
@@ -169,10 +171,11 @@ def create_app(
     return app
 
 
-def _page_context(source: StatusSource, auth: Authenticator, api: Sources | None, *, pushes_itself: bool) -> PageContext:
+def _page_context(source: StatusSource, auth: Authenticator, api: Sources | None, parts: Parts | None) -> PageContext:
     if api is None:
         return PageContext(environment(), auth, source, Reader(auth.store, "", SystemClock()))
-    return PageContext(environment(), auth, source, api.reader, api.rules, pushes_itself)
+    pushes_itself, recipes = (False, ()) if parts is None else (parts.pushes_itself, parts.recipes)
+    return PageContext(environment(), auth, source, api.reader, api.rules, pushes_itself, recipes)
 
 
 def _add_routes(app: FastAPI, source: StatusSource) -> None:

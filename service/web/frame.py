@@ -45,7 +45,7 @@ MORE: tuple[Screen, ...] = (
     ("/schedule", "nav.schedule", Permission.READ, ("/schedule",)),
     ("/fleet", "nav.fleet", Permission.READ, ("/fleet",)),
     ("/devices", "nav.devices", Permission.READ, ("/devices",)),
-    ("/settings", "nav.settings", Permission.READ, ("/settings", "/diagnostics", "/users", "/user", "/machine")),
+    ("/settings", "nav.settings", Permission.READ, ("/settings", "/diagnostics", "/users", "/user", "/machine", "/administration")),
     ("/audit", "nav.audit", Permission.AUDIT, ("/audit",)),
 )
 """Screens in the navigation bar, and behind its last entry: address, key of the text, permission, and addresses that select the entry."""

@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.config import key_lines, load_machine
+from abbe.service.config import load_machine
 from abbe.service.config_schema import ROOM_K
 from abbe.service.errors import ConfigError
 from abbe.service.site import site_of
+from abbe.service.toml_text import key_lines
 from abbe.service.verification.verify import SAME_AIR_C
 
 GOOD = """

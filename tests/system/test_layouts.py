@@ -27,6 +27,7 @@ RENEW = bool(os.environ.get("ABBE_PICTURES"))
 SCREENS = {
     "home": "/", "alarms": "/alarms", "alarm": "/alarm?id=2", "check": "/check?id=24", "new": "/new", "proposal": "/proposal",
     "table": "/table", "trends": "/trends?pictures=true", "runs": "/runs", "result": "/result", "settings": "/settings",
+    "administration": "/administration",
 }  # fmt: skip
 NEAR_PX = 3
 """Rounding of positions; a button that moves by more is told."""

@@ -25,7 +25,8 @@ from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024
 BY_FORM = ("/login", "/logout", "/proposal/approve", "/proposal/reject", "/alarm/acknowledge", "/alarm/shelve",
            "/settings/password", "/settings/pin",
-           *(f"/users/{form}" for form in ("add", "role", "password", "disable", "enable")))  # fmt: skip
+           *(f"/users/{form}" for form in ("add", "role", "password", "disable", "enable")),
+           *(f"/administration/{form}" for form in ("laboratory", "limits", "certificates", "schedule", "read")))  # fmt: skip
 """Not in the OpenAPI document; that these are all is asked in tests/service/web/test_bodies.py."""
 PATIENCE_S = 30.0
 

@@ -75,7 +75,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
     from abbe.service.core.push_recovery import recover_at_start
-    from abbe.service.core.setup import ServiceSetup
+    from abbe.service.core.setup import MachineFileSource, ServiceSetup
     from abbe.service.core.table_watch import look_at_table
     from abbe.service.jobs.check import run_check
     from abbe.service.mqtt.broker import Topics
@@ -123,6 +123,7 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         campaigns=_campaigns(config.alarm.campaign, site, folder),
         campaign=None if site.urls.cnc is None else campaign_on(site, folder, live),
         stated=loaded.summary(),
+        source=MachineFileSource(loaded, lambda other: setup_of(other, port)),
         warnings=check_plausibility(config, folder, SystemClock().utc().date()).warnings,
     )
 

@@ -10,6 +10,7 @@ from itertools import count
 
 from abbe.service.channel.messages import (
     Answer,
+    ChangeFile,
     ConfirmPrompt,
     CoreRequest,
     Jobs,
@@ -27,6 +28,7 @@ from abbe.service.channel.messages import (
 )
 from abbe.service.clock import Clock
 from abbe.service.domain.job_state import JobState
+from abbe.service.domain.machine_file import FileEdit
 from abbe.service.domain.progress import DeviceStatus, RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import CoreUnavailable
@@ -180,6 +182,11 @@ class CoreLine:
     async def push(self, proposal: int, key: str, who: str) -> Answer:
         """Push an approved proposal now. Raises CoreUnavailable as `start` does."""
         return await self._ask(PushNow(request=next(self._numbers), proposal=proposal, key=key, who=who))
+
+    async def change_file(self, sha256: str, edits: tuple[FileEdit, ...], reason: str, who: str, *, looser: bool) -> Answer:
+        """Change values of the machine file with the digest ``sha256``. Raises CoreUnavailable if no answer comes."""
+        request = ChangeFile(request=next(self._numbers), sha256=sha256, edits=edits, reason=reason, looser=looser, who=who)
+        return await self._ask(request)
 
     async def _ask(self, request: CoreRequest) -> Answer:
         self.snapshot()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import PurePath
 from types import MappingProxyType
 
 from fastapi import FastAPI
@@ -17,8 +18,10 @@ from abbe.service.web.frame import current
 from abbe.service.web.language import catalogue
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.context import PageContext
+from abbe.service.web.pages.file_fields import with_names
 
 ROWS = 200
+FILE = "machine file"
 DEEDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
     {
         "log_in": ("POST /login",),
@@ -34,6 +37,12 @@ DEEDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "user_password": ("POST /users/password", "abbe user password"),
         "user_disable": ("POST /users/disable", "abbe user disable"),
         "user_enable": ("POST /users/enable", "abbe user enable"),
+        "file_laboratory": ("POST /administration/laboratory",),
+        "file_limits": ("POST /administration/limits",),
+        "file_certificates": ("POST /administration/certificates",),
+        "file_schedule": ("POST /administration/schedule",),
+        "file_read": ("POST /administration/read",),
+        "file": (FILE,),
         "own_password": ("POST /settings/password",),
         "own_pin": ("POST /settings/pin",),
         "token_new": ("abbe user token new",),
@@ -88,7 +97,7 @@ def deed(record: AuditEntry) -> Deed:
     known = _OF.get(record.action)
     what = record.action if known is None else current().translate(f"deed.{known}")
     end, sign = _end(record.outcome)
-    return Deed(record, _who(record.who), what, _target(record.target), end, sign)
+    return Deed(record, _who(record.who), what, _target(record), end, sign)
 
 
 def _who(who: str) -> str:
@@ -100,11 +109,15 @@ def _who(who: str) -> str:
     return found["user"] or frame.translate("audit.by_token", name=found["owner"], token=found["token"])
 
 
-def _target(target: str) -> str:
-    """The target without numbers of jobs and addresses, which only programs need."""
-    frame, text = current(), _JOB.sub("", target)
+def _target(record: AuditEntry) -> str:
+    """The target without numbers of jobs and addresses, which only programs need; of a command's file the name."""
+    frame, text = current(), _JOB.sub("", record.target)
+    if text.startswith("/") and record.action.startswith("abbe "):
+        return PurePath(text).name
     if text.startswith(("/", "job ")):
         return ""
+    if record.action == FILE:
+        return with_names(text)
     if text.startswith("user "):
         name, _, change = text.removeprefix("user ").partition(": ")
         role = change.rpartition(" ")[2]

@@ -24,7 +24,7 @@ from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject, Rules
-from abbe.service.domain.machine_file import MachineFileSummary, StatedValue
+from abbe.service.domain.machine_file import FileEdit, MachineFileSummary, StatedValue
 from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
@@ -139,6 +139,7 @@ WEB = [
     m.ConfirmPrompt(request=3, job="0" * 12, prompt=2, who="user:bob"),
     m.RollBack(request=3, push=7, crc=0xFFFFFFFF, reason="worse since then", key="k", who="user:ann"),
     m.PushNow(request=4, proposal=3, key="k", who="user:ann"),
+    m.ChangeFile(request=5, sha256="ab" * 32, edits=(FileEdit("verify.helix_rms_um", "6.5"),), reason="new", looser=True, who="user:ann"),
 ]
 
 

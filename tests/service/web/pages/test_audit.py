@@ -9,6 +9,7 @@ import pytest
 from fastapi import FastAPI
 
 from abbe.service.cli.administration.audit import CHANGES, RECORDS_ITSELF
+from abbe.service.core.file_changes import ACTION
 from abbe.service.core.orders import CAMPAIGN, PUSH, ROLLBACK
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.rendering.phrases import LANGUAGES
@@ -32,7 +33,7 @@ def test_everything_that_is_recorded_has_words_in_every_language(plant: Plant) -
     add_jobs(orders, core, (), ())
     add_table_orders(orders, core)
     actions = changing(plant.app) | changing(orders)
-    actions |= {f"abbe {command}" for command in (*CHANGES, *RECORDS_ITSELF)} | {CAMPAIGN, PUSH, ROLLBACK, BUNDLE_ACTION}
+    actions |= {f"abbe {command}" for command in (*CHANGES, *RECORDS_ITSELF)} | {CAMPAIGN, PUSH, ROLLBACK, BUNDLE_ACTION, ACTION}
     told = [action for some in DEEDS.values() for action in some]
     assert len(actions) > 55
     assert actions == set(told)
@@ -71,3 +72,16 @@ def test_the_screen_has_words_above_and_the_record_in_a_fold(running: Served) ->
         assert "POST /" not in above
         number = running.store.audit.events(1)[0].id
         assert re.search(rf'<li value="{number}">user:anna · POST /proposal/approve · proposal 3 · done 303</li>', fold)
+
+
+@pytest.mark.parametrize(
+    ("action", "target", "expected"),
+    [
+        ("abbe check-config", "/etc/abbe/machine.toml", "machine.toml"),
+        ("POST /login", "/login", ""),
+        (ACTION, "verify.helix_rms_um 5.0 → 6.5, schedule[night].cron – → 0 2 * * *",
+         "Helix rms, µm 5.0 → 6.5, Times: minute hour day month weekday (night) – → 0 2 * * *"),
+    ],
+)  # fmt: skip
+def test_a_command_names_its_file_and_a_change_its_values(action: str, target: str, expected: str) -> None:
+    assert deed(AuditEvent(who="os:root@box", action=action, target=target, outcome="done")).target == expected

@@ -1,0 +1,205 @@
+"""Fields of the forms that change the machine file: what they show of it, and which changes a sent form asks for.
+
+A field only turns what a person typed into JSON. Bounds and words are judged by the parser of the machine file alone.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
+from abbe.service.web.frame import current
+
+Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many"]
+"""``optional``: a text, ``maybe``: a number, that may be absent; ``range``: two numbers; ``yes``: yes or no; ``many``: boxes to tick."""
+_NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
+_KEY = re.compile(r"\b(issuer|item|verify|limits|calibration|schedule)(?:\[([^\]]*)\])?(\.[a-z_.]*[a-z_])")
+ENDS = ("low", "high")
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """One value of the machine file in a form. ``options``: what can be chosen; ``required``: never empty."""
+
+    key: str
+    kind: Kind
+    options: tuple[str, ...] = ()
+    required: bool = False
+
+
+def _fields(section: str, **kinds: Kind) -> tuple[Field, ...]:
+    return tuple(Field(f"{section}.{name}", kind) for name, kind in kinds.items())
+
+
+PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
+ISSUER = (
+    *(Field(f"issuer.{name}", "text", required=True) for name in ("laboratory", "city", "country", "person")),
+    *_fields("issuer", address="text", accreditation="text", procedure="text", prefix="text", customer="text", customer_address="text"),
+    Field("issuer.place", "choice", PLACES),
+)
+ITEM = _fields("item", maker="text", model="text", serial="text", place="text")
+VERIFY = _fields("verify", body_diagonal_um="number", helix_rms_um="number")
+PUSH = _fields(
+    "limits",
+    table_value_um="number",
+    table_change_um="number",
+    table_step_um="number",
+    table_beyond_percent="number",
+    table_walk_um="number",
+    measurement_age_h="number",
+    two_people="yes",
+)
+MEASURE = (
+    *_fields("limits", feed_mm_min="number", temperature_c="range", run_temperature_c="range"),
+    Field("limits.continue_after", "many", ("door", "beam", "temperature", "ballbar")),
+    *_fields("limits", suspend_s="number", settle_s="number"),
+)
+CERTIFICATES = _fields(
+    "calibration",
+    ballbar="date",
+    ballbar_is="text",
+    laser="date",
+    laser_is="text",
+    artefact="date",
+    artefact_is="text",
+    room="date",
+    room_temperature_c="range",
+)
+LABORATORY, LIMITS = (*ISSUER, *ITEM), (*VERIFY, *PUSH, *MEASURE)
+SCHEDULE = (
+    Field("name", "text", required=True),
+    Field("recipe", "choice"),
+    Field("cron", "optional"),
+    Field("every_h", "maybe"),
+    Field("first", "optional"),
+    Field("timezone", "text", required=True),
+    Field("grace_s", "number"),
+    Field("catch_up", "choice", ("skip", "once")),
+    Field("on_alarm", "choice", ("none", "propose")),
+    Field("needs.idle", "yes"),
+    Field("needs.warm_min", "number"),
+    Field("needs.air", "yes"),
+    Field("needs.operator", "choice", ("any", "present", "absent")),
+)
+"""Fields of one schedule; their keys follow ``schedule[N].``."""
+SCHEDULE_DEFAULTS = {"timezone": "UTC", "recipe": "quick-check", "catch_up": "skip", "on_alarm": "none", "needs.operator": "any"}
+
+
+def schedule_fields(number: int, recipes: Sequence[str]) -> tuple[Field, ...]:
+    """The fields of the schedule with a number, from 1."""
+    options = {"recipe": tuple(recipes)}
+    return tuple(replace(one, key=f"schedule[{number}].{one.key}", options=options.get(one.key, one.options)) for one in SCHEDULE)
+
+
+@dataclass(frozen=True, slots=True)
+class ShownField:
+    """A field with its value as the form shows it. ``texts``: one text, or the two ends of a range, or what is ticked; ``fixed``: the
+    environment of the service sets the value."""
+
+    field: Field
+    texts: tuple[str, ...]
+    fixed: bool = False
+
+    @property
+    def label(self) -> str:
+        """Key of its name in the catalogues, without the number of a schedule."""
+        return re.sub(r"\[\d+\]", "", self.field.key)
+
+    @property
+    def options(self) -> tuple[str, ...]:
+        """What can be chosen; a value that is no option any more stays one."""
+        return tuple(dict.fromkeys((*self.field.options, *(text for text in self.texts if text and self.field.kind == "choice"))))
+
+
+def shown_fields(fields: Sequence[Field], stated: MachineFileSummary) -> list[ShownField]:
+    """The fields with the values in force."""
+    known = {one.key: one for one in stated.values}
+    found = []
+    for field in fields:
+        one = known.get(field.key)
+        blank = one is None or (one.origin == "default" and field.kind in {"optional", "maybe"})
+        value = None if one is None or blank else json.loads(one.value)
+        if value is None:
+            value = SCHEDULE_DEFAULTS.get(field.key.partition("].")[2])
+        found.append(ShownField(field, _texts(field, value), one is not None and one.origin == "environment"))
+    return found
+
+
+def _texts(field: Field, value: Any) -> tuple[str, ...]:
+    if value is None and field.kind == "range":
+        return ("", "")
+    if isinstance(value, list):
+        return tuple(_text(one) for one in value)
+    return ("" if value is None else _text(value),)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return f"{value:.15g}" if isinstance(value, float) else str(value)
+
+
+def edits_of(fields: Sequence[Field], form: Mapping[str, str], stated: MachineFileSummary) -> tuple[FileEdit, ...]:
+    """The changes that a sent form asks for: values that differ from those in force. Fields that the form lacks change nothing."""
+    known = {one.key: one for one in stated.values}
+    found = []
+    for field in fields:
+        if not any(name in form for name in _names(field)):
+            continue
+        sent, one = _sent(field, form), known.get(field.key)
+        now = None if one is None or (sent is None and one.origin == "default") else json.loads(one.value)
+        if sent != now and not (sent in ("", None) and now in ("", None)):
+            found.append(FileEdit(field.key, json.dumps(sent, ensure_ascii=False)))
+    return _whole(found, fields, form, known)
+
+
+def _whole(found: list[FileEdit], fields: Sequence[Field], form: Mapping[str, str], known: Mapping[str, Any]) -> tuple[FileEdit, ...]:
+    """A laboratory without any name is removed; a chosen place alone makes none."""
+    if ISSUER[0] in fields:
+        named = any(form.get(one.key, "").strip() for one in ISSUER if one.kind == "text")
+        if not named and ISSUER[0].key in form:
+            others = [edit for edit in found if not edit.key.startswith("issuer.")]
+            return (*others, FileEdit("issuer", "null")) if ISSUER[0].key in known else tuple(others)
+    return tuple(found)
+
+
+def _names(field: Field) -> tuple[str, ...]:
+    return (field.key, *(f"{field.key}.{end}" for end in ENDS)) if field.kind == "range" else (field.key,)
+
+
+def _sent(field: Field, form: Mapping[str, str]) -> Any:
+    """What a form has for a field, as JSON; None: nothing. What is no number stays text, which the parser refuses with its own words."""
+    text = form.get(field.key, "").replace("\r\n", "\n").strip()
+    match field.kind:
+        case "number" | "maybe":
+            return _number(text)
+        case "yes":
+            return text == "yes"
+        case "range":
+            low, high = (_number(form.get(f"{field.key}.{end}", "").strip()) for end in ENDS)
+            return None if low is None and high is None else [low, high]
+        case "many":
+            return [one for one in field.options if form.get(f"{field.key}.{one}") == "yes"]
+        case "date" | "optional":
+            return text or None
+    return text
+
+
+def _number(text: str) -> Any:
+    plain = text.replace(",", ".")
+    return None if not text else json.loads(plain) if _NUMBER.fullmatch(plain) else text
+
+
+def with_names(text: str) -> str:
+    """A text with the names that the forms have for keys of the machine file."""
+    frame = current()
+
+    def name(found: re.Match[str]) -> str:
+        known = frame.state("file", found[1] + found[3])
+        return found[0] if known == found[1] + found[3] else f"{known} ({found[2]})" if found[2] else known
+
+    return _KEY.sub(name, text)
