@@ -120,7 +120,7 @@ class OneBankTables:
             The staged table has no image, or another session holds the lease.
         """
         if owner != self._owner or bank == self._active or not self._staged or image_in(bytes(self._staged)) != self._staged:
-            raise Refused("one table", f"seal bank {bank}", "no image is staged in it, or the lease is not ours")
+            raise Refused("one table", f"seal bank {bank}", "no table is staged in this bank, or another owner has the lease")
         self._sealed = True
 
     async def activate(self, bank: int, *, expect_crc: int, expect_gen: int, owner: int) -> None:
@@ -137,7 +137,7 @@ class OneBankTables:
         """
         new = bytes(self._staged or b"")
         if owner != self._owner or bank == self._active or not self._sealed or zlib.crc32(new) != expect_crc:
-            raise Refused("one table", "exchange", "the staged table is not the expected one, or the lease is not ours")
+            raise Refused("one table", "exchange", "the staged table is not the expected one, or another owner has the lease")
         try:
             old = image_in(await self._c.read_table())
             now = await self.comp_status()

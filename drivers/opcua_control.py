@@ -264,7 +264,7 @@ async def _secured(client: Any, url: str, access: dict[str, str]) -> None:
             client.set_user(access["user"])
             client.set_password(_first_line(access["password_file"]))
     except (ValueError, TypeError, IndexError, OSError) as error:
-        remedy = "PEM files; our certificate needs a URI among its alternative names"
+        remedy = "give PEM files; Abbe's certificate needs a URI among its alternative names"
         raise BadUrl(ascii(url), "open device", f"certificate, key or password: {error}", remedy) from None
 
 

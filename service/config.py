@@ -104,7 +104,7 @@ def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:
         for number, entry in enumerate(values.get(name, ()), start=1):
             found, more = [key for key in one if key in entry], [key for key in other if key in entry]
             if found and more:
-                wanted = f"expected {' and '.join(one)} without {', '.join(other)}, or the other way round"
+                wanted = f"expected either {' and '.join(one)}, or {', '.join(other)}"
                 raise ConfigError(
                     f"{path}: {name}[{number}]: {wanted}, got {', '.join([*found, *more])}", f"remove {more[0]} or {found[0]}"
                 )

@@ -374,7 +374,7 @@ class Conversation:
             raise BadFrame(
                 self._name,
                 "identify",
-                "an ACK came instead of the INFO",
+                "the reply does not identify the box (ACK instead of INFO)",
                 "check that the device at this port is a ball-bar box of protocol version 1",
             )
         return answer
@@ -383,7 +383,12 @@ class Conversation:
         """Read the settings of the box (firmware 1.1 and later); errors as for ``identify``."""
         answer = await self._ask(read_settings_command, "read settings")
         if not isinstance(answer, BoxSettings):
-            raise BadFrame(self._name, "read settings", "an ACK came instead of the SETTINGS", "update the box's firmware to 1.1 or later")
+            raise BadFrame(
+                self._name,
+                "read settings",
+                "the reply does not state the settings (ACK instead of SETTINGS)",
+                "update the box's firmware to 1.1 or later",
+            )
         return answer
 
     async def command(self, kind: int, make: Callable[[int], bytes]) -> None:

@@ -109,7 +109,9 @@ def _fresh(file: DeviceFile | None) -> DeviceCheck:
         )
     if file.limits.update_s is not None:
         return DeviceCheck(
-            "freshness", PASSED, f"no counter and no time stamp; by its manual it is renewed every {file.limits.update_s:g} s"
+            "freshness",
+            PASSED,
+            f"no counter and no time stamp; by its manual the device renews its reading every {file.limits.update_s:g} s",
         )
     return DeviceCheck("freshness", NOT_PROVED, "no counter, no time stamp and no update_s: an old value cannot be told from a new one")
 

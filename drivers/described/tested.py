@@ -107,7 +107,9 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
     if stated["device_sha256"] != sha256:
         raise NotProved(device, f"open to {needed}", "the device file has changed since its test", remedy)
     if stated["serial_no"] != serial_no:
-        detail = f"device {serial_no or 'without number'} answers, device {stated['serial_no'] or 'without number'} was tested"
+        detail = (
+            f"device {serial_no or 'without serial number'} answers, but device {stated['serial_no'] or 'without serial number'} was tested"
+        )
         raise NotProved(device, f"open to {needed}", detail, remedy)
     if needed not in abilities:
         why = "; ".join(f"{check}: {text}" for check, verdict, text in findings if verdict != CheckVerdict.PASSED)

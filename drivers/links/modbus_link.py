@@ -181,7 +181,7 @@ class ModbusLine:
             await self._wire.gap()
             if self._wire.strays or not await self._proven(self._canary, 0):
                 self.dirty = True
-                detail = "a reply came, but the canary read after it was wrong: the reply may be stale"
+                detail = "a reply came, but the check registers read after it were wrong: the reply may belong to an earlier request"
                 raise BadFrame(self._name, str(request), detail, "look for a second Modbus master, line noise or a slow device")
         return answer
 
@@ -205,7 +205,7 @@ class ModbusLine:
                 return
             if not self._wire.up:
                 break
-        detail = f"the canary registers were wrong {_PROOFS} times"
+        detail = f"the check registers (canary) were wrong {_PROOFS} times"
         raise LinkDown(
             self._name, "verify the line after a disturbance", detail, "check that the device is on; look for a second Modbus master"
         )

@@ -120,7 +120,7 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
     """
     canary, bits = counts["CANARY_I32"] & 0xFFFFFFFF, counts["CANARY_F32"]
     if canary != CANARY_I32 or bits != CANARY_F32_BITS:
-        detail = f"the canary registers hold {canary:08x} {bits:08x} instead of {CANARY_I32:08x} {CANARY_F32_BITS:08x}"
+        detail = f"the check registers (canary) hold {canary:08x} {bits:08x} instead of {CANARY_I32:08x} {CANARY_F32_BITS:08x}"
         orders = {"int32": _order(CANARY_I32, canary), "float32": _order(CANARY_F32_BITS, bits)}
         named = [f"{name}: {_ORDER_NAMES[order]}" for name, order in orders.items() if order]
         raise WrongDevice(device, "identify", "; ".join([detail, *named]), _SET_ORDER if named else _WHO)

@@ -153,8 +153,8 @@ def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] 
         )
     if not wanted <= observable_names:
         raise ValueError(
-            f"motion tables: {', '.join(sorted(wanted - observable_names))} cannot be written under their own names: the readings do not "
-            "separate them from other motions. Measure with a second tool length, or make tables for this tool only (any_tool=False)"
+            f"motion tables: the readings do not separate {', '.join(sorted(wanted - observable_names))} from other motions. "
+            "Measure with a second tool length, or make tables for this tool only (any_tool=False)"
         )
     return wanted
 

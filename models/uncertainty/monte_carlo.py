@@ -188,7 +188,8 @@ def validate(value: F1, expanded: F1, found: MonteCarlo, *, digits: int = 1) -> 
     tolerance = numerical_tolerance(found.u, digits)
     if not (found.ends_known <= VALIDATION_SHARE * tolerance).all():
         raise ValueError(
-            f"Monte Carlo: {found.trials} trials cannot validate the law of propagation, because they do not give the interval's ends to a "
-            f"fifth of half a unit in the last of {digits} digits of u; run adaptive(..., digits={digits}, share={VALIDATION_SHARE})"
+            f"Monte Carlo: {found.trials} trials are too few to validate the law of propagation: the intervals' ends must be known to "
+            f"{VALIDATION_SHARE} of the numerical tolerance of u at {digits} digits; run adaptive(..., digits={digits}, "
+            f"share={VALIDATION_SHARE})"
         )
     return Validation(np.abs(value - expanded - found.symmetric.low), np.abs(value + expanded - found.symmetric.high), tolerance)

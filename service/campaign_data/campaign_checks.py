@@ -77,7 +77,9 @@ def _against_feed(run: Run) -> list[CampaignIssue]:
     unit = next((text for factor, text in TIME_UNITS.items() if FASTEST <= ratio / factor <= slowest), "t_s or feed_mm_min is wrong")
     what = f"it took {ratio:.2g} times as long as its path takes at its feed_mm_min: {unit}"
     return [
-        CampaignIssue(run.run_id, what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: drift is judged by them", False)
+        CampaignIssue(
+            run.run_id, what, "write t_s in s of the campaign's clock and feed_mm_min in mm/min: Abbe needs them to judge drift", False
+        )
     ]
 
 
@@ -92,7 +94,7 @@ def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
         others = meets.pop(worst)
         meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
         what = f"its t_s lies within that of {_named(others)}: one machine cannot measure two runs at a time"
-        out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: drift is judged by it", False))
+        out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: Abbe needs this to judge drift", False))
     if len(out) > 1 and 2 * len(out) >= len(spans):
         what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
         return [CampaignIssue(next(iter(spans)), what, out[0].remedy, False)]

@@ -34,13 +34,16 @@ def _unobservable(*, each: int, means: bool, interval_s: float, turning: int) ->
     highest_hz = 0.5 / interval_s  # Nyquist
     if means:
         # A spike as long as one interval usually spans two values; one as long as two intervals fills a value wherever it begins.
-        spikes = f"a spike at a reversal keeps its height if it lasts {2.0 * interval_s:.2g} s, one of a single reading is 1/{each} as high"
-        sides = f"{turning} means span a reversal of an axis and mix both sides of its lost motion"
-        fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower one"
+        spikes = (
+            f"a spike at a reversal keeps its height if it lasts {2.0 * interval_s:.2g} s, "
+            f"a spike of a single reading shrinks to 1/{each} of its height"
+        )
+        sides = f"{turning} averages span a reversal of an axis and mix both sides of its lost motion"
+        fast = f"vibration above {highest_hz:.2g} Hz is averaged down, or looks like a slower vibration"
     else:
         spikes = f"a spike at a reversal that lasts less than {interval_s:.2g} s may lie between two values"
         sides = f"{turning} values replace readings in which an axis reverses; the lost motion there is not seen"
-        fast = f"vibration above {highest_hz:.2g} Hz looks like a slower one, or like noise"
+        fast = f"vibration above {highest_hz:.2g} Hz looks like a slower vibration, or like noise"
     return [spikes, sides, fast]
 
 

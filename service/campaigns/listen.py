@@ -106,7 +106,8 @@ async def listen_to(session: Session, recorder: Recorder, test: TestPlan, report
     heard = await _hear(session, (QUIET * (LASER_DWELL_S + plan[0].settle_s)))
     if not all(air_is_compensated(r.status) for r in heard.readings):
         raise MeasurementFault(
-            f"test {test.label}: the laser's environmental compensation was switched off", "switch it on, start the program again"
+            f"test {test.label}: the laser's environmental compensation was switched off",
+            "switch the compensation on, then start the program again",
         )
     found, planned = _detected(test, heard, plan, resolution_mm(laser))
     lines = named(found, planned)

@@ -212,15 +212,15 @@ def temperature_note(plan: MeasuringPlan) -> str:
     """Describe the part of U that no measurement can reduce."""
     inputs = plan.tools.inputs
     return (
-        f"in every U: scales known to {inputs.u_scale_temperature_k:g} K ({inputs.scale_expansion_per_k * 1e6:g} µm/m/K), "
-        f"which alone make U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
+        f"every U includes the temperature of the scales, known to {inputs.u_scale_temperature_k:g} K "
+        f"({inputs.scale_expansion_per_k * 1e6:g} µm/m/K); this alone makes U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
     )
 
 
 def judge_note(plan: MeasuringPlan) -> str:
     """Describe the holdout run and its cost."""
     if plan.judge is None:
-        return "no run is kept out of the fit to judge: the minutes are too few for one, so `abbe discover` can prove no name"
+        return "every run is fitted: there are too few minutes for a run that only judges, so `abbe discover` can prove no effect"
     return f"{plan.judge.label} is not fitted: it judges what is found, and takes {plan.judge.minutes:.1f} minutes"
 
 

@@ -109,11 +109,14 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
 def _same_plan(store: Store, campaign: CampaignRecord, lines: JournalEntries, site: Site, plan: CampaignPlan) -> None:
     owner = lines.begun.owner
     if owner is not None and not lines.ended and not owner.is_gone():
-        raise UnsafeToMove(f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until it has ended")
+        raise UnsafeToMove(
+            f"campaign {campaign.name!r} is being measured (process {owner.pid} on {owner.host})", "wait until the measurement has ended"
+        )
     for run in store.runs.all(campaign.id):
         if run.visible_status == RUNNING:
             raise UnsafeToMove(
-                f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})", "wait until it has ended"
+                f"run {run.label} of campaign {campaign.name} is being measured (process {run.owner.pid})",
+                "wait until the measurement has ended",
             )
     if lines.begun.plan != plan_hash(plan):
         raise PreconditionsChanged(

@@ -155,7 +155,7 @@ async def while_moving(t: Trial, site: Site) -> None:
     status = await t.controller.status()
     trouble = tripped(status)
     if trouble is not None:
-        t.fail(FLAG, f"not tried, no axis may move: {trouble.detail}")
+        t.fail(FLAG, f"not tried, because no axis may move now: {trouble.detail}")
         return
     x, y, z = (round(v, 5) for v in status.position_mm)
     home, there, why_not = (x, y, z), away(site, (x, y, z)), ""
@@ -268,7 +268,7 @@ async def commission_levels(controller: Controller, store: Store, site: Site, cl
         )
     base = await read_base(controller)
     if base.status.lease_owner:
-        raise UnsafeToMove("another owner has the lease of the banks", "wait until it has run out, then begin again")
+        raise UnsafeToMove("another owner has the lease of the banks", "wait until the lease has run out, then begin again")
     owner = (secrets.randbits(15) + 1) << 16
     trial = Trial(controller, clock or SystemClock(), base, owner, owner ^ 1)
     earlier = await asyncio.to_thread(_earlier_boots, store, site)

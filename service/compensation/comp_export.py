@@ -280,7 +280,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool, turned: bo
         if form.sign.sure:
             continue
         if turned is not None:
-            out.append(f"{form.name}: sign by the measured step: {'the other one than' if turned else 'as'} in docs/reference/formats.md")
+            out.append(f"{form.name}: sign by the measured step: {'opposite to that' if turned else 'as'} in docs/reference/formats.md")
         else:
             out.append(
                 f"{form.name}: no manual states the sign ({form.sign.text}): write the 10 µm step first and measure it "
@@ -532,10 +532,10 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     try:
         sealed = read_plain(seal, LARGEST)
     except NotPlainError as error:
-        raise SignatureRefused(f"{seal}: {error.strerror}", "remove it: then the files are a candidate") from None
+        raise SignatureRefused(f"{seal}: {error.strerror}", "remove the signature: the files then count as a candidate") from None
     except OSError as error:
         raise FileFormatError(
-            f"{seal}: cannot be read: {error.strerror}", "make it readable, or remove it: then the files are a candidate"
+            f"{seal}: cannot be read: {error.strerror}", "make the signature readable, or remove it: the files then count as a candidate"
         ) from None
     expected = ExpectedContent(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
     found = contents(path)

@@ -26,7 +26,7 @@ from abbe.service.rendering.page_file import write_page
 
 FORMAT = "abbe-drop/1"
 RECEIPT, BEFORE = "receipt.json", "before"
-LOOK = "look at it; nothing was written"
+LOOK = "check this file; nothing was written"
 
 
 @dataclass(frozen=True, slots=True)

@@ -149,7 +149,7 @@ class Pushing:
         order = await self._order(wanted)
         key = _control_key(self.store, self.site)
         if key in _under_way:
-            raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until it has ended")
+            raise MachineInUse(f"a push into {self.site.name} is under way in this process", "wait until the push has ended")
         _under_way.add(key)
         # Refuse new pauses first, then wait for a pending one: no pause can come between and hold an unverified table in force.
         self.control.no_pause_reason = "an unverified table may be in force: stop the push, or let it finish"

@@ -146,7 +146,7 @@ async def accept(controller: TableController, store: Store, site: Site, by: str 
         if ended.settled and journal[-1].state is not PushState.OPERATOR:
             changed = before.active_bank != now.active_bank
             what = (
-                "the table from before it was made active again: look at the controller once more"
+                "the table from before the push is active again: look at the controller once more"
                 if changed
                 else "the active table is unchanged"
             )
@@ -205,7 +205,7 @@ def _refuse_if_under_way(store: Store, site: Site, journal: Journal) -> None:
     owner = Owner(**process) if process else None
     ours = owner == this_process()
     if owner is not None and (pushes_here(store, site) if ours else not owner.is_gone()):
-        raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until it has ended")
+        raise MachineInUse(f"push {last.push} is under way (process {owner.pid})", "wait until the push has ended")
 
 
 async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:

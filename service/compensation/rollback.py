@@ -102,7 +102,7 @@ async def rollback(
     why = f"not measured: byte for byte {wanted.how}; ordered back by a person"
 
     def reasons() -> list[str]:
-        return [] if wanted.image in known_images(journal) else ["UNKNOWN: the journal does not know this table as one that was in force"]
+        return [] if wanted.image in known_images(journal) else ["UNKNOWN: by the journal, this table was never in force"]
 
     async def in_force_before() -> VerificationResult:
         return VerificationResult(not reasons(), why)
@@ -223,7 +223,7 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
         return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", with_notes(error))
     if back is None:
         return JobOutcome("refused", "the table from before is in force already; nothing was written")
-    text = f"push {back.pushed.push_id}: in force again (CRC {back.pushed.crc:08X}): {back.how}"
+    text = f"push {back.pushed.push_id}: the table is in force again (CRC {back.pushed.crc:08X}): {back.how}"
     return JobOutcome("kept", f"{text}; the machine is unverified now: run a quick check")
 
 

@@ -65,7 +65,7 @@ def lock_machine(url: str | None) -> Iterator[None]:
             f"it is unknown whether the machine at {url} is in use: {path} cannot be used ({error.strerror})", _remedy(path.parent)
         ) from None
     except _AlreadyLocked as holder:
-        raise MachineInUse(f"the machine at {url} is in use by {holder}", "wait until it has ended") from None
+        raise MachineInUse(f"the machine at {url} is in use by {holder}", "wait until the other process has ended") from None
     try:
         with suppress(OSError):  # the lock is held; on a full disk only the holder's name is missing
             os.ftruncate(handle, 0)
@@ -103,7 +103,7 @@ def _shared(folder: Path) -> Path:
         folder.mkdir()
     found = folder.lstat()
     if not stat.S_ISDIR(found.st_mode):
-        raise UnsafeToMove(f"{folder} is not a folder, so it is unknown whether the machine is in use", "remove it")
+        raise UnsafeToMove(f"{folder} is not a folder, so it is unknown whether the machine is in use", "remove this file")
     if found.st_mode & SHARED != SHARED:
         if found.st_uid != os.geteuid():
             raise UnsafeToMove(

@@ -80,7 +80,7 @@ def _proof(changed: ChangedSince) -> list[str]:
             f"the gap is {before} µm rms without and {after} with it where {floor} µm is noise"
         ]
     if judged < NEAR:
-        out.append("  the change does not make runs likelier that were not used to find it")
+        out.append("  the change does not explain the runs that were kept out of the search for it")
     unconfirmed = [_name(c.motion, c.part) for c in changed.changes if c.halves < HALVES]
     if unconfirmed:
         out.append(f"  not chosen by each half of the runs alone: {', '.join(unconfirmed)}")

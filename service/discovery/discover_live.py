@@ -76,7 +76,8 @@ def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s:
     for run in runs:
         if run.visible_status == RUNNING:
             raise UnsafeToMove(
-                f"run {run.label} of campaign {begun.name} is being measured (process {run.owner.pid})", "wait until it has ended"
+                f"run {run.label} of campaign {begun.name} is being measured (process {run.owner.pid})",
+                "wait until the measurement has ended",
             )
     states = {run.label: run.visible_status for run in runs}
     left = _remaining(plan.tests, states)

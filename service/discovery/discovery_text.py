@@ -209,7 +209,9 @@ def next_of(finding: Finding) -> list[str]:
     if finding.verdict == "unknown":
         there = "; ".join(location_lines(finding.location))
         what = f"repeat the measurement where the gap appears ({there})" if there else "repeat the whole campaign: the gap was not located"
-        return [f"measure next: {what}, and again later: a gap that recurs belongs to the machine, one that does not to that session"]
+        return [
+            f"measure next: {what}, and again later: a gap that recurs belongs to the machine, a gap that does not recur to that session"
+        ]
     if finding.verdict == "none":
         again = "measure next: repeat the runs that were never fitted and disagree, some of them with the role identify"
         return ([again] if disagreeing(finding) else []) + unseen_lines(finding)

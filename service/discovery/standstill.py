@@ -101,9 +101,9 @@ def lines_of(answer: StandstillAnswer) -> list[str]:
     time, u_time = (v / 60.0 for v in found.response.time_constant_s)
     out = [
         f"campaign {answer.campaign}: {len(answer.runs)} runs at standstill (ISO 230-3), temperatures {', '.join(answer.sensors)}",
-        f"{word}. The displacement since the start of a run is {raw} µm rms; in runs left out, each predicted from all the others, "
-        f"temperatures at once leave {static} µm and their lagged response {lagged} µm.",
-        f"U (k = 2) covers {left.covered:.0%} of the readings of runs left out; typical U {plain(2e3 * _typical_u(answer), 2)} µm",
+        f"{word}. The displacement since the start of a run is {raw} µm rms. Each run was predicted from all other runs: "
+        f"{static} µm rms remain if temperatures act at once, {lagged} µm if they act with a lag.",
+        f"U (k = 2) covers {left.covered:.0%} of the readings in these predictions; typical U {plain(2e3 * _typical_u(answer), 2)} µm",
         f"time constant of the lag {' ± '.join(with_uncertainty(time, u_time))} min; the better model takes {way}",
     ]
     out.append("by sensor, all others unchanged:")

@@ -454,7 +454,7 @@ class RunRecord(RunFacts):
             return parse(doc)
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             text = f"run {self.campaign}/{self.label}: its documents have a missing or invalid field: {err}"
-            raise StoreError(text, "it was not written by Abbe, or is damaged: restore a backup") from None
+            raise StoreError(text, "Abbe did not write this, or the database is damaged: restore a backup") from None
 
     @property
     def visible_status(self) -> str:

@@ -95,7 +95,7 @@ class Columns:
             The run is sealed.
         """
         if self.deviation_mm is None:
-            raise MeasurementFault("the run is sealed: its readings are withheld", "it can only be predicted")
+            raise MeasurementFault("the run is sealed: its readings are withheld", "Abbe can only predict this run")
         return self.deviation_mm
 
     @property
@@ -409,7 +409,7 @@ class Run:
         except (AttributeError, KeyError, TypeError, ValueError) as err:
             raise StoreError(
                 f"run {doc.get('campaign', '')}/{doc.get('run_id', '')}: its document has a missing or invalid field: {err}",
-                "it was not written by Abbe, or is damaged: restore a backup",
+                "Abbe did not write this, or the database is damaged: restore a backup",
             ) from None
 
     def to_document(self) -> Doc:

@@ -112,7 +112,7 @@ def one_way(schedule: Schedule) -> Schedule:
     if bool(schedule.cron) == bool(schedule.every_h):
         raise ValueError(f"expected either cron = ... or every_h = ..., got {'both' if schedule.cron else 'neither'}")
     if schedule.first != FIRST_UTC and not schedule.every_h:
-        raise ValueError("expected every_h = ... beside first = ...: only every_h counts from a first time, a cron expression does not")
+        raise ValueError("first = ... needs every_h = ...: a cron expression has no first time")
     return schedule
 
 

@@ -15,7 +15,7 @@ REMEDY = "do not load this file"
 ALIKE = 0.2
 """Tables count as a multiple of the expected ones if they differ from that multiple by less than this share."""
 FACTORS = (
-    (-1.0, "the sign is wrong: it would double every error"),
+    (-1.0, "the sign is wrong: this file would double every error"),
     (1000.0, "1000 times too large: µm were taken for mm"),
     (1e-3, "1000 times too small: mm were taken for µm"),
     (25.4, "25.4 times too large: mm were taken for inches"),
@@ -110,7 +110,7 @@ def _mistake(found: Compensation, expected: Compensation) -> str:
         rest = [k for k in range(3) if k != a]
         one, other = np.linalg.norm(have[..., a] + want[..., a]), np.linalg.norm(want[..., a])
         if other > 0 and one < ALIKE * other and np.linalg.norm((have - want)[..., rest]) < ALIKE * size:
-            return f"the sign of {AXES[a]} is wrong: it would double its error"
+            return f"the sign of {AXES[a]} is wrong: this file would double the error of that axis"
         turned = np.arange(3)
         turned[rest] = rest[::-1]
         exchanged = np.stack([_moving(found, p[:, turned], way)[:, turned] for way in (1, -1)])

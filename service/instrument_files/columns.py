@@ -314,7 +314,7 @@ def _places(body: _ReadingRows) -> tuple[F1, F1, str]:
         return np.full(n, at), np.ones(n), f"the axis stood at {at:g} mm: displacements since the first reading"
     target = body.numbers("target")[0] * LENGTHS[columns.target.unit]
     if columns.direction is None:
-        return target, _by_order(body, target), "the table has no column of the direction: the order of the targets decided it"
+        return target, _by_order(body, target), "the table has no column of the direction: the order of the targets decided the direction"
     return target, _by_words(body, columns.direction), ""
 
 

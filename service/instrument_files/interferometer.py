@@ -91,7 +91,9 @@ def lines_of(found: CyclicError) -> list[str]:
             f"{plain(np.degrees(e.quadrature_rad))} degrees from quadrature"
         )
     noise = plain(found.u_reading / NM, 2)
-    out.append(f"{found.samples} samples, {found.outliers:.1%} of them outliers; in a single reading it counts as u = {noise} nm")
+    out.append(
+        f"{found.samples} samples, {found.outliers:.1%} of them outliers; in a single reading the cyclic error counts as u = {noise} nm"
+    )
     return out
 
 

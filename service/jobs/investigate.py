@@ -118,7 +118,7 @@ async def _discovered(context: InvestigationContext, alarm: Alarm, note: Note) -
 
     def report(progress: Progress) -> None:
         if stopped.is_set() or context.control.stopping:
-            raise Stopped("the search was stopped", "it will start again")
+            raise Stopped("the search was stopped", "Abbe will start the search again")
         context.progress(progress)
 
     try:
@@ -206,7 +206,9 @@ def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
     """
     gain_um = (promised.before_mm - promised.after_mm) * 1e3
     if against and rms_um > BESIDE * gain_um:
-        raise TableRefused(f"{rms_um:.1f} µm rms of the readings may not be correctable by tables, which promise {gain_um:.1f} µm", against)
+        raise TableRefused(
+            f"tables may be unable to correct {rms_um:.1f} µm rms of the readings, and promise a gain of only {gain_um:.1f} µm", against
+        )
 
 
 def promise_text(store: Store, made: StoredProposal) -> str:

@@ -94,7 +94,7 @@ def _switch(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> O
     if truth.unsafe:
         return _pending(state, f"not safe now: {truth.unsafe}")
     if truth.states[1 - truth.active] is BankState.LAID_ASIDE and truth.crc[1 - truth.active] == f.base_crc:
-        return _pending(state, "the old table acts after the control's next start: restart it, and move nothing before")
+        return _pending(state, "the old table acts after the control's next start: restart the control, and move nothing before")
     if state is PushState.ACTIVATING_BACK:
         text = known.verdict.text if isinstance(known.verdict, OperationRefused) else "the activation of the old table did not happen"
         return _pending(state, text) if known.backs >= BACKS else record(PushState.ROLLBACK, again=text)

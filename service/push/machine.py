@@ -228,7 +228,7 @@ def _unconfirmed(f: PushFacts, known: PushKnowledge) -> Operation:
     if which == "base":
         return _not_in_force(f, known, known.truth)
     if which == "off" and isinstance(known.verdict, OperationRefused):
-        return record(PushState.ABORTED, why="compensation was switched off at the control; the old table is in it")
+        return record(PushState.ABORTED, why="compensation was switched off at the control; the control holds the old table")
     if which in ("candidate", "off"):
         return record(PushState.ROLLBACK, why=known.stop or "activated, but not confirmed")
     return record(PushState.OPERATOR, why="the active table is neither the old nor the new one", **mismatch_doc(f, known.truth))

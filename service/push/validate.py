@@ -384,7 +384,7 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
     if round(counts) > LARGEST:
         yield f"OVERFLOW: {counts:.0f} units do not fit 16 bits"
     if len(active) != len(v):
-        yield "CHANGE: the table in force has another grid and was not given on this one"
+        yield "CHANGE: the table in force has another grid, and its values on the new grid are missing"
         return
     yield from size_reasons(p, v, active, limits)
     slopes = [abs(d - c) / (b - a) for c, d, a, b in zip(v, v[1:], p, p[1:], strict=False)]

@@ -51,7 +51,7 @@ def whole_samples(payload: bytes) -> bytes:
     if len(raw) % _SAMPLE.size:
         raise StoreError(
             f"a chunk of codec {BAR_CODEC} has {len(raw)} bytes, not a multiple of {_SAMPLE.size}",
-            "it was not written by Abbe, or is damaged: restore a backup",
+            "Abbe did not write this, or the database is damaged: restore a backup",
         )
     return raw
 
@@ -67,7 +67,7 @@ def encode_json(records: Iterable[dict[str, Any]]) -> bytes:
     try:
         lines = "\n".join(json.dumps(one, allow_nan=False, ensure_ascii=False, separators=(",", ":")) for one in records)
     except ValueError:
-        raise StoreError("a record with NaN or Infinity is not stored", "give null where there is no value") from None
+        raise StoreError("a record with NaN or Infinity cannot be stored", "give null where there is no value") from None
     return zlib.compress(lines.encode(), _LEVEL)
 
 
@@ -84,7 +84,8 @@ def decode_json(payload: bytes) -> list[dict[str, Any]]:
         return [json.loads(line) for line in text.split(b"\n") if line]
     except ValueError as err:
         raise StoreError(
-            f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})", "it was not written by Abbe, or is damaged: restore a backup"
+            f"a chunk of codec {JSON_CODEC} does not hold JSON lines ({err})",
+            "Abbe did not write this, or the database is damaged: restore a backup",
         ) from None
 
 
@@ -93,5 +94,5 @@ def _inflate(payload: bytes, codec: str) -> bytes:
         return zlib.decompress(payload)
     except zlib.error as err:
         raise StoreError(
-            f"a chunk of codec {codec} cannot be unpacked ({err})", "it was not written by Abbe, or is damaged: restore a backup"
+            f"a chunk of codec {codec} cannot be unpacked ({err})", "Abbe did not write this, or the database is damaged: restore a backup"
         ) from None

@@ -138,7 +138,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
     except (AttributeError, KeyError, TypeError, ValueError) as err:
         raise StoreError(
             f"run {record.campaign}/{record.label}: its documents have a missing or invalid field: {err}",
-            "it was not written by Abbe, or is damaged: restore a backup",
+            "Abbe did not write this, or the database is damaged: restore a backup",
         ) from None
 
 

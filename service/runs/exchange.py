@@ -212,7 +212,8 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
         written.append(read)
         if read.setup.t_set_s is None:
             raise StoreError(
-                f"run {run.campaign}/{run.label}: its set-up has no t_set_s", "it was not written by Abbe, or is damaged: restore a backup"
+                f"run {run.campaign}/{run.label}: its set-up has no t_set_s",
+                "Abbe did not write this, or the database is damaged: restore a backup",
             )
         setups.setdefault(read.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": read.setup.t_set_s})
         document, path = run_document(read, run, chunks), folder / RunEntry.read(entry).file

@@ -109,7 +109,7 @@ def _run_data(run: Run, blocks: int) -> RunData:
     if run.test not in TESTS:
         raise MeasurementFault(f"run {label}: the solver does not know the test {run.test!r}", "leave it out")
     if run.is_sealed:
-        raise MeasurementFault(f"run {label}: it is sealed, so it has no readings", "it can only be predicted")
+        raise MeasurementFault(f"run {label}: it is sealed, so it has no readings", "Abbe can only predict this run")
     valid = columns.valid
     if int(valid.sum()) < LEAST:
         raise MeasurementFault(f"run {label}: only {int(valid.sum())} valid readings of {len(columns)}", "measure it again")

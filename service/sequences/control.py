@@ -105,7 +105,7 @@ def check_ours(status: ControllerStatus) -> None:
         The controller runs an NC program, or is not in remote mode.
     """
     if status.program_runs:
-        raise ProgramRuns("an NC program runs", "wait until it has ended, then start again; nothing was sent to the machine")
+        raise ProgramRuns("an NC program runs", "wait until the program has ended, then start again; nothing was sent to the machine")
     if not status.remote:
         raise RemoteLost("the controller is not in remote mode", READY)
 

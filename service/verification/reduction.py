@@ -166,7 +166,7 @@ def reduction_of(runs: Sequence[Run], axis: str, materials: Mapping[str, AxisMat
     at = scale_temperature(runs, axis, material)
     notes = _notes(runs, axis, at, material)
     if at is None:
-        return Reduction(None, "not reduced to 20 °C: no material temperature", notes)
+        return Reduction(None, "not reduced to 20 °C: the temperature of the scales is neither recorded nor stated", notes)
     if material is None or material.scale_per_k is None or material.u_scale_per_k is None:
         holds = f"the figures hold at {at.text} ({at.origin})"
         return Reduction(None, f"not reduced to 20 °C: no expansion coefficient of the scale; {holds}", notes)

@@ -103,7 +103,7 @@ def _add_stopping(app: FastAPI, core: CoreLine) -> None:
         visit: Visit = request.state.visit
         running = next((job for job in core.jobs() if job.ended_utc is None), None)
         if running is None:
-            return problem(409, "nothing that this service can stop is running")
+            return problem(409, "no job is running that this service could stop")
         visit.target = f"job {running.id}"
         return answered(core, await core.steer(running.id, "stop", visit.principal.name))
 

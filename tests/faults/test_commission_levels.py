@@ -271,7 +271,7 @@ async def test_where_nothing_may_move_the_watch_over_the_axes_is_not_proved(plac
     b.sim.world.controller.switches.spindle_turning = True
     found = await commission_levels(b.session.controller, store, b.site)
     missing = {name: text for name, ok, text in found.rows() if not ok}
-    assert "no axis may move: the spindle turns" in missing["interlocks"]
+    assert "no axis may move now: the spindle turns" in missing["interlocks"]
     assert "a correct activation is refused as well: interlock" in missing["swap_compares"]
     assert found.capabilities.level == 2
 

@@ -50,7 +50,7 @@ def add_login(app: FastAPI, env: Environment, auth: Authenticator) -> None:
         visit: Visit = request.state.visit
         fields = await form_of(request)
         if fields is None:
-            return problem(413, "a login is a short form of two fields")
+            return problem(413, "a login has only the two fields name and password (or PIN)")
         name, by_pin = fields.get("name", ""), "pin" in fields
         visit.target = "unknown user"
         origin = await asyncio.to_thread(_login_origin, auth, request, name, pin=by_pin)

@@ -107,9 +107,9 @@ def test_what_thinning_hides_is_told_in_figures(monkeypatch: pytest.MonkeyPatch)
     done, hidden, remedy = lines_of(told)
     assert "every 3 of them were averaged, 80 values in all" in done
     assert "effects hidden by this reduction may still be present" in hidden
-    assert f"{told.values_with_reversal} means span a reversal of an axis" in hidden
+    assert f"{told.values_with_reversal} averages span a reversal of an axis" in hidden
     assert f"vibration above {told.highest_hz:.2g} Hz" in hidden
-    assert "is 1/3 as high" in hidden
+    assert "shrinks to 1/3 of its height" in hidden
     assert f"keeps its height if it lasts {6.0 * step:.2g} s" in hidden  # half as long, it lies in two means
     assert "--without RUN" in remedy
 

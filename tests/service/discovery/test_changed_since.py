@@ -297,7 +297,7 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
             {"gap": GAP | {"before_um": 1.02}, "judged": -1.0},
             {},
             False,
-            "the change does not make runs likelier that were not used to find it",
+            "the change does not explain the runs that were kept out of the search for it",
         ),
         ({"gap": None, "judged": None}, {"halves": 0}, False, "too few set-ups"),
         ({}, {"rivals": [{"name": "C0Y", "less_evidence": 1.0}]}, False, "cannot tell it from squareness of X and Y"),

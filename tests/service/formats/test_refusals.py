@@ -138,6 +138,6 @@ def test_a_file_of_the_other_convention_is_caught_against_the_expected_table() -
     """The same numbers under the other sign: what a Siemens file means when somebody writes −e into it."""
     plain = _table(P, V)
     file = FORMATS["siemens-eec"].write(_table(P, -V), TOLD)
-    with pytest.raises(TableContradicts, match="the sign is wrong: it would double every error"):
+    with pytest.raises(TableContradicts, match="the sign is wrong: this file would double every error"):
         check_same(FORMATS["siemens-eec"].read(file, TOLD), plain, 1e-6)
     assert max(d.size_mm for d in check_same(plain, plain, 1e-9)) == 0.0

@@ -164,7 +164,7 @@ def test_without_a_column_of_the_direction_the_order_decides(folder: Folder) -> 
     content = folder.read("t.csv", TABLE, columns)
     assert content.test is not None
     assert content.test.direction.tolist() == [1, 1, 1, -1, -1, -1]
-    assert "the order of the targets decided it" in content.notes[0]
+    assert "the order of the targets decided the direction" in content.notes[0]
     again = TABLE.replace("200,0;199,9890;+;20,6\n", "200,0;199,9890;+;20,6\n" * 2)
     assert folder.refused("t.csv", again, columns).startswith("t.csv:7: target 200 mm three times in a row")
 

@@ -45,7 +45,7 @@ def test_bytes_of_a_sample_are_fixed() -> None:
 @given(st.binary())
 def test_any_bytes_give_samples_or_one_error(payload: bytes) -> None:
     for unpack in (decode_bar, decode_json):
-        with pytest.raises(StoreError, match="not written by Abbe"):
+        with pytest.raises(StoreError, match="Abbe did not write this"):
             unpack(payload)
 
 

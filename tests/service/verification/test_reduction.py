@@ -129,10 +129,14 @@ def test_a_sensor_in_some_runs_only_is_remarked() -> None:
 @pytest.mark.parametrize(
     ("made", "materials", "why"),
     [
-        (line(), {}, "not reduced to 20 °C: no material temperature"),
-        (line(), {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)}, "not reduced to 20 °C: no material temperature"),
+        (line(), {}, "not reduced to 20 °C: the temperature of the scales is neither recorded nor stated"),
+        (
+            line(),
+            {"X": AxisMaterial(11.5e-6, 0.6e-6, None, 0.2, 0.0)},
+            "not reduced to 20 °C: the temperature of the scales is neither recorded nor stated",
+        ),
         (line(24.0), {}, "no expansion coefficient of the scale; the figures hold at 24.00 ± 0.40 °C (recorded in the runs)"),
-        (line(), {"Y": STEEL}, "not reduced to 20 °C: no material temperature"),
+        (line(), {"Y": STEEL}, "not reduced to 20 °C: the temperature of the scales is neither recorded nor stated"),
     ],
 )
 def test_without_temperature_or_coefficient_nothing_is_reduced_and_the_report_says_why(made, materials, why) -> None:
@@ -184,7 +188,7 @@ def test_axes_of_a_diagonal_may_have_different_temperatures() -> None:
 def test_one_axis_without_a_coefficient_leaves_the_diagonals_as_measured_and_says_so() -> None:
     told = evaluate([diagonal()], None, {"X": STEEL, "Y": STEEL})
     assert {f.method for f in told.figures} == {"ISO 230-6"}
-    assert "body diagonals: not reduced to 20 °C: Z: no material temperature" in told.remarks
+    assert "body diagonals: not reduced to 20 °C: Z: the temperature of the scales is neither recorded nor stated" in told.remarks
     assert all(u > 0.0 for _, u in figures(told, "Body diagonals", "E_d"))
 
 
