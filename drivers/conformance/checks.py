@@ -239,10 +239,10 @@ async def quality(probe: DeviceUnderTest, file: DeviceFile | None, ask: Ask) -> 
         try:
             await _mean(probe, probe.moved[0])
         except DriverError as error:
-            await ask("Free it again.")
+            await ask("Clear the beam again, or let the plunger back into its range.")
             await probe.zero()
             return DeviceCheck("quality", PASSED, f"an invalid reading is refused: {error.detail}")
-        await ask("Free it again.")
+        await ask("Clear the beam again, or let the plunger back into its range.")
     except DriverError as error:
         return DeviceCheck("quality", FAILED, f"after the beam was free again: {error}")
     where = "driver" if file is None else "device file"

@@ -143,7 +143,7 @@ class ListenedControl:
         self._refuse("activate", _NO_TABLES)
 
 
-_NO_TABLES = "it proves neither two banks nor read-back nor compare-and-swap, so no table is written into it"
+_NO_TABLES = "it proves neither two banks nor read-back nor compare-and-swap, so Abbe writes no table into it"
 
 
 def _status(host_s: float, conditions: Condition, position_mm: Point) -> ControllerStatus:

@@ -164,7 +164,7 @@ class ModbusWire:
             if not connected:
                 await run_to_end(_given_up(client, connecting))
         if not connected:
-            raise LinkDown(self.name, "connect", "refused, busy or unreachable", self._remedy())
+            raise LinkDown(self.name, "connect", "the device refused the connection, is busy or cannot be reached", self._remedy())
         self._client = client
         self._keep_alive()
 

@@ -285,7 +285,7 @@ def _room_beside(database: Path) -> Path:
     needed, free = database.stat().st_size + ROOM_BYTES, shutil.disk_usage(database.parent).free
     if free < needed:
         raise BackupRefused(
-            f"a shared backup needs {needed / 1e6:.0f} MB beside {database}, and {free / 1e6:.0f} MB are free",
+            f"a shared backup needs {needed / 1e6:.0f} MB beside {database}, but only {free / 1e6:.0f} MB are free",
             "free disk space, or leave out --share",
         )
     return database.with_name(f".{database.name}.copy-{secrets.token_hex(4)}")

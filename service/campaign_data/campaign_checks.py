@@ -355,7 +355,8 @@ def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> 
     if count > HALF * of:
         return [CampaignIssue(label, f"deviations up to {largest:.3g} mm: they look like µm", "write deviation_mm in mm", True)]
     if count > max(SPIKES * of, 1):
-        what = f"{count} of {of} readings are beyond {LARGEST_MM:g} mm, up to {largest:.3g} mm: µm, or the bar or the beam was lost"
+        seen = f"{count} of {of} readings are beyond {LARGEST_MM:g} mm, up to {largest:.3g} mm"
+        what = f"{seen}: the unit is µm, or the bar or the beam was lost"
         return [CampaignIssue(label, what, "write deviation_mm in mm, or mark the lost readings with valid 0", True)]
     return []
 

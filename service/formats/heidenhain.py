@@ -93,7 +93,7 @@ def _check_positions(tables: list[AxisTable], settings: FormatSettings) -> None:
     if np.ptp(units) > 1e-3 or abs(power - round(power)) > 1e-6:
         raise FormatRefused(
             f"{WHAT}: spacing over {tables[0].axis} is {units[0] * UNIT_MM:g} mm, this control wants a power of two times 0.1 µm",
-            f"take 6.5536 mm (2^16 times 0.1 µm), or double or half of it; {NOTHING}",
+            f"take a spacing of 6.5536 mm (2^16 times 0.1 µm), or double or half that; {NOTHING}",
         )
     steepest = max(float(np.abs(np.diff(v)).max()) for t in tables for v in (t.forward_mm, t.backward_mm))
     if steepest > units[0] * UNIT_MM / STEEPEST:

@@ -76,7 +76,7 @@ class DaskExecutor:
             self._client: Any = Client(address, timeout="10s", set_as_default=False)
         except (OSError, ValueError) as err:  # TimeoutError is an OSError
             raise ConfigError(
-                f"no Dask scheduler answers at {address}: {type(err).__name__}", "dask scheduler, then dask worker ADDRESS"
+                f"no Dask scheduler answers at {address}: {type(err).__name__}", "start `dask scheduler`, then `dask worker ADDRESS`"
             ) from None
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:

@@ -236,7 +236,7 @@ def _rows(parts: _Sections, targets: int, runs: int) -> tuple[list[Row], list[st
         out.append((line, way, target - 1, file.number(line, cells[2], "the deviation")))
         words.append(cells[2])
     if len(out) != runs * targets:
-        raise file.wrong(lines[-1][0], f"the deviations end here: {len(out)} of {runs * targets}")
+        raise file.wrong(lines[-1][0], f"the file ends after {len(out)} of {runs * targets} deviations")
     return out, words
 
 

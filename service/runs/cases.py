@@ -78,7 +78,7 @@ def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> P
     if t_s[0] < t_set - CLOCKS_S:
         raise MeasurementFault(
             f"run {run.run_id}: its first reading is {t_set - t_s[0]:.0f} s before its set-up was mounted (t_set_s)",
-            "write t_s and t_set_s in seconds of one clock for the whole campaign: drift is judged by them",
+            "write t_s and t_set_s in seconds of one clock for the whole campaign: Abbe needs them to judge drift",
         )
     common: dict[str, Any] = {
         "label": run.run_id,

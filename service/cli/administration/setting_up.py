@@ -134,7 +134,7 @@ def _days(text: str) -> dict[str, date]:
         return {}
     parts = text.split(",")
     if len(parts) != len(INSTRUMENTS):
-        raise ValueError("two days, separated by a comma, are expected (- for an instrument without)")
+        raise ValueError("two days, separated by a comma, are expected (- for an instrument without a certificate)")
     return {role: date.fromisoformat(day.strip()) for role, day in zip(INSTRUMENTS, parts, strict=True) if day.strip() != "-"}
 
 

@@ -32,7 +32,7 @@ def person(world: World) -> Callable[[str], Awaitable[None]]:
         elif text.startswith("Block the beam"):
             world.set(state=1 << 2)
         else:
-            assert text == "Free it again."
+            assert text == "Clear the beam again, or let the plunger back into its range."
             world.set(state=0)
 
     return act

@@ -83,7 +83,7 @@ def test_names_in_the_encodings_that_occur(encoding: str, name: str) -> None:
 GOOD = renishaw()
 WRONG = {
     "cut off": (GOOD[: GOOD.index("4   2")], "x.rtl:36: section EOF:: is missing"),
-    "a row too few": (GOOD.replace("4   1      3.0\n", ""), "x.rtl:37: the deviations end here: 11 of 12"),
+    "a row too few": (GOOD.replace("4   1      3.0\n", ""), "x.rtl:37: the file ends after 11 of 12 deviations"),
     "a row too many": (GOOD.replace("\n\nEOF", "\n5   1      3.0\n\nEOF"), "x.rtl:39: more rows than 4 runs of 3 targets"),
     "rows exchanged": (GOOD.replace("1   2 ", "1   3 ", 1), "x.rtl:28: run 1, target 3, expected run 1, target 2"),
     "run forgotten": (GOOD.replace("2   3 ", "3   3 "), "x.rtl:30: run 3, target 3, expected run 2, target 3"),
