@@ -74,7 +74,7 @@ async def test_no_job_opens_a_device_that_was_not_tested(url: str, world: World,
     with pytest.raises(NotProved, match="motion displacement: no known motion was made"):
         await open_laser(f"{url}&tested={report}")
     report.write_text(report.read_text().replace("40175", "40176"))
-    with pytest.raises(NotProved, match="device 40175 answers, device 40176 was tested"):
+    with pytest.raises(NotProved, match="device 40175 answers, but device 40176 was tested"):
         await open_laser(f"{url}&tested={report}")
     other = changed(tmp_path, ("resolution = 10.0", "resolution = 20.0"))
     with pytest.raises(NotProved, match="the device file has changed since its test"):
