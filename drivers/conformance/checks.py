@@ -196,7 +196,7 @@ def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
         return ""
     read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"
     if abs(got_mm) <= move.tolerance_mm:
-        return f"stuck: {read}: it does not follow the target"
+        return f"stuck: {read}: the reading does not follow the target"
     ratio = got_mm / move.mm
     sign = f"sign: it grows the wrong way, change sign in the {where}" if ratio < 0 else ""
     if abs(abs(got_mm) - abs(move.mm)) <= move.tolerance_mm:
