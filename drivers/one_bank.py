@@ -84,7 +84,7 @@ class OneBankTables:
             Another owner has the lease.
         """
         if self._owner not in (0, owner):
-            raise Refused("one table", "take the lease", "another push of this process has it")
+            raise Refused("one table", "take the lease", "another push of this process has the lease")
         self._owner = owner
 
     async def release(self, owner: int, *, anyway: bool = False) -> None:

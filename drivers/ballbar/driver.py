@@ -95,7 +95,7 @@ class Box:
             raise SettingsChanged(self._name, "start stream", detail, _RESTORE)
         if now.unit != frames.NANOMETRE:
             raise SettingsChanged(
-                self._name, "start stream", "the box reads in inches", "switch it to millimetres, then connect to it again"
+                self._name, "start stream", "the box reads in inches", "switch the box to millimetres, then connect again"
             )
 
     def check_can(self, rate_hz: int, range_mm: float) -> None:
@@ -119,7 +119,7 @@ class Box:
         if isinstance(end, OtherSettings):
             return SettingsChanged(self._name, "stream", str(end), _RESTORE)
         if isinstance(end, OtherPace):
-            return DeviceFault(self._name, "stream", str(end), "did another program start the box? end it, then measure this test again")
+            return DeviceFault(self._name, "stream", str(end), "end any other program that uses the box, then measure this test again")
         return self.rebooted(str(end))
 
     def rebooted(self, detail: str) -> Rebooted:
@@ -316,7 +316,7 @@ class SerialBallBar:
         if rate_hz <= 0 or 1000 % rate_hz:
             raise Refused(self.name, "start stream", f"{rate_hz} Hz does not divide 1000", "choose 1000, 500, 250, 200, 125, 100 ...")
         if self._streaming:
-            raise Refused(self.name, "start stream", "a stream is already running", "end it first")
+            raise Refused(self.name, "start stream", "a stream is already running", "end the running stream first")
         self._streaming = through = True
         try:
             await self._ready()

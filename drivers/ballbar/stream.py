@@ -298,9 +298,7 @@ class Stream:
             f"{bad_bytes} bad bytes; of {tracker.lost + tracker.accepted} samples {tracker.lost} were lost, {tracker.strays} impossible, "
             f"{tracker.duplicates} came twice or late"
         )
-        return BadFrame(
-            self._device, "read samples", detail, "every gap is recorded; if it happens often, look at the cable and its shield"
-        )
+        return BadFrame(self._device, "read samples", detail, "Abbe records every gap; if gaps come often, check the cable and its shield")
 
     def lossy(self) -> LossyLine:
         """Return the error for a stream that has lost too many samples."""

@@ -127,7 +127,7 @@ class ControllerSession:
                 raise WrongDevice(self.name, "identify", detail, "install the matching firmware, or the matching version of this program")
         if self._map and found != self._map:
             detail = f"its register map changed: {found}, it was {self._map}"
-            raise WrongDevice(self.name, "identify", detail, "another firmware: identify it anew, check its tables")
+            raise WrongDevice(self.name, "identify", detail, "the controller has another firmware: connect again, and check its tables")
         self._map = found
 
 

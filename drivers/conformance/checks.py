@@ -62,7 +62,9 @@ async def identity(probe: DeviceUnderTest, file: DeviceFile | None) -> list[Devi
     if file is not None and file.modbus is not None:
         whole = any(SIZE[known.type] > 1 for known in file.identity)
         text = (
-            f"{file.modbus.order}, by the identity registers" if whole else "no known content of two registers; the known motion shows it"
+            f"{file.modbus.order}, by the identity registers"
+            if whole
+            else "no known content of two registers; the known motion shows the byte order"
         )
         found.append(DeviceCheck("byte order", PASSED if whole else NOT_PROVED, text))
     return found
@@ -168,7 +170,7 @@ async def _moved(probe: DeviceUnderTest, file: DeviceFile | None, name: str, mov
     await ask("Move it back to where it was.")
     back = await _mean(probe, name) - before
     if abs(back) > move.tolerance_mm:
-        return DeviceCheck(what, FAILED, f"back at the start it reads {back:+.4f} mm: it lost counts, or slipped")
+        return DeviceCheck(what, FAILED, f"back at the start the instrument reads {back:+.4f} mm: it lost counts, or something slipped")
     share = 100.0 * move.tolerance_mm / abs(move.mm)
     return DeviceCheck(
         what, PASSED, f"{move.mm:g} mm read as {got:.4f} mm and {back:+.4f} mm back: sign right, scale right to {share:.2g} %"
@@ -198,7 +200,7 @@ def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
     if abs(got_mm) <= move.tolerance_mm:
         return f"stuck: {read}: the reading does not follow the target"
     ratio = got_mm / move.mm
-    sign = f"sign: it grows the wrong way, change sign in the {where}" if ratio < 0 else ""
+    sign = f"sign: the reading grows the wrong way, change sign in the {where}" if ratio < 0 else ""
     if abs(abs(got_mm) - abs(move.mm)) <= move.tolerance_mm:
         return f"{sign} ({read})"
     share = move.tolerance_mm / abs(move.mm)

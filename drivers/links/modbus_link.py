@@ -70,7 +70,7 @@ class ExceptionRule:
 
 _MAP = "the register map may not fit this device: compare its map version and address with docs/protocols"
 _DIAGNOSE = "look at the device's own diagnostics"
-_WAIT = "the device is busy: try again in a moment, look at the device if it persists"
+_WAIT = "the device is busy: try again in a moment; if the device stays busy, look at it"
 _GATEWAY = "look at the gateway and at the line behind it"
 
 EXCEPTIONS = {
@@ -394,7 +394,7 @@ class ModbusLink:
             return await asyncio.shield(task)
         except asyncio.CancelledError:
             if self._closed and task.cancelled():
-                raise LinkDown(self.name, str(request), "the link was closed", "open it again") from None
+                raise LinkDown(self.name, str(request), "the link was closed", "open the link again") from None
             self._abandoned = True  # wait for a request on the wire, but send nothing more for this caller
             if not self._on_wire:
                 task.cancel()
@@ -450,7 +450,7 @@ class ModbusLink:
 
     async def _ready(self, patience_s: float) -> None:
         if self._closed:
-            raise LinkDown(self.name, "connect", "the link was closed", "open it again")
+            raise LinkDown(self.name, "connect", "the link was closed", "open the link again")
         if not self._wire.up:
             await self._connect(patience_s)
         await self._line.ready()

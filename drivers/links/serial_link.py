@@ -359,5 +359,5 @@ def serial_remedy(path: str, error: Exception) -> str:
     if number in (errno.EACCES, errno.EPERM) or not os.access(path, os.R_OK | os.W_OK):
         return "no permission: add this user to the group that owns the port (often dialout)"
     if number in (errno.EBUSY, errno.EAGAIN, errno.EWOULDBLOCK) or "lock" in str(error):
-        return "another program holds the port: close it"
+        return "another program holds the port: close that program"
     return "check that this is a serial port, and that it supports this baud rate"

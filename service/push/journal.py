@@ -324,7 +324,7 @@ class StoreBook:
             return cls(store, chain, clock, 1, GENESIS, ())
         last = (await book.entries())[-1]
         if last.state not in TERMINAL or last.state is PushState.OPERATOR:
-            raise UnsafeToMove(f"push {last.push} of {chain} is in state {last.state}", "finish it first")
+            raise UnsafeToMove(f"push {last.push} of {chain} is in state {last.state}", "finish this push first")
         return cls(store, chain, clock, last.push + 1, last.digest, ())
 
     async def entries(self) -> Journal:

@@ -199,7 +199,8 @@ class Discoveries(Repository):
                 insert_row(connection, discovery_steps, discovery_id=discovery_id, seq=seq, state=state, doc=doc, utc=self._db.now())
             except IntegrityError:
                 raise StoreError(
-                    f"discovery {discovery_id} has step {seq} already: another process works on it", "wait for it, then run this again"
+                    f"discovery {discovery_id} has step {seq} already: another process works on it",
+                    "wait until the other process has ended, then run this again",
                 ) from None
             return None if model is None else _add_version(connection, model, discovery_id, self._db.now())
 

@@ -87,7 +87,7 @@ async def test_no_job_opens_a_device_that_was_not_tested(url: str, world: World,
 @pytest.mark.parametrize(
     ("changes", "check", "why"),
     [
-        ((("sign = -1 ", "sign = 1 "),), "motion displacement", "sign: it grows the wrong way, change sign in the device file"),
+        ((("sign = -1 ", "sign = 1 "),), "motion displacement", "sign: the reading grows the wrong way, change sign in the device file"),
         ((("scale = 10.0", "scale = 20.0"),), "motion displacement", "scale: 10 mm is read as 20.0000 mm, 2 times (an interferometer"),
         ((("scale = 10.0", "scale = 13.7"),), "motion displacement", "1.37 times; divide scale in the device file by 1.37"),
         ((('unit = "nm"', 'unit = "um"'),), "motion displacement", "1000 times (the unit is 1000 times too large)"),

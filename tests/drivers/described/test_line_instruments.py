@@ -101,7 +101,7 @@ async def test_a_polled_gauge_passes_with_its_shipped_file(value: Path) -> None:
 @pytest.mark.parametrize(
     ("away", "why"),
     [
-        ("5.0", "sign: it grows the wrong way"),
+        ("5.0", "sign: the reading grows the wrong way"),
         ("-0.19685", "scale: 5 mm is read as 0.1968 mm, 0.03936 times (it sends inches, the file says mm)"),
         ("0.0", "stuck: 5 mm is read as 0.0000 mm"),
     ],

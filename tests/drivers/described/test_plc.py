@@ -119,7 +119,7 @@ async def test_an_axis_the_wrong_way_round_is_named(plc: tuple[Plc, str]) -> Non
 
     report = await device_test(url, Options(move=Move(5.0, 0.01), ask=crossed, faults=False), UTC)
     assert [one.check for one in report.failed] == ["motion y"]
-    assert "sign: it grows the wrong way" in report.failed[0].text
+    assert "sign: the reading grows the wrong way" in report.failed[0].text
     assert report.abilities == ()
 
 

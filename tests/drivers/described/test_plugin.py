@@ -75,7 +75,7 @@ async def test_it_passes_the_test_of_devices(device: tuple[Device, str]) -> None
     acme.sign = -1.0
     report = await device_test(url, Options(move=Move(10.0, 0.01), ask=acme.person, faults=False), "2026-11-26T00:00:00+00:00")
     assert [one.check for one in report.failed] == ["motion displacement"]
-    assert report.failed[0].text.startswith("sign: it grows the wrong way")
+    assert report.failed[0].text.startswith("sign: the reading grows the wrong way")
 
 
 async def test_the_doctor_says_which_driver_is_not_tested(device: tuple[Device, str], tmp_path: Path) -> None:
