@@ -78,7 +78,7 @@ EXCEPTIONS = {
     2: ExceptionRule("illegal data address (or not writable)", Refused, _MAP),
     3: ExceptionRule("illegal data value", Refused, _MAP),
     4: ExceptionRule("device failure", DeviceFault, _DIAGNOSE),
-    5: ExceptionRule("acknowledged, still busy with it", ReplyTimeout, _WAIT),
+    5: ExceptionRule("accepted, but not finished yet", ReplyTimeout, _WAIT),
     6: ExceptionRule("busy", ReplyTimeout, _WAIT),
     8: ExceptionRule("memory parity error", DeviceFault, _DIAGNOSE),
     10: ExceptionRule("gateway path unavailable", LinkDown, _GATEWAY, dead=True),

@@ -196,7 +196,7 @@ def _times(less: float) -> str:
         return "just as likely"
     if less < CLEAR:
         return f"{plain(math.exp(less), 2)} times less likely"
-    return f"10^{less / math.log(10.0):.0f} times less likely, but in a slightly different form it would look the same"
+    return f"10^{less / math.log(10.0):.0f} times less likely, but a slightly different form of it would look the same"
 
 
 def next_of(finding: Finding) -> list[str]:

@@ -326,7 +326,7 @@ def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
 
 def _other(push: PushedTable) -> str:
     at = f" at {push.control}" if push.control else ""
-    what = "its table was never verified; if this is the same control, Abbe measures nothing on it"
+    what = "its table was never verified; if that push went into this control, Abbe refuses to measure here"
     return f"push {push.push} of machine {push.machine!r}{at} is in state {push.state}: {what}"
 
 

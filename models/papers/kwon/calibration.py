@@ -307,7 +307,8 @@ class KwonCalibration:
         if self.prior_factor > 1.0:
             warnings.append(f"all prior standard deviations were multiplied by {self.prior_factor:.3g} to explain these deviations")
         if factor > 1.0:
-            warnings.append(f"the points scatter {np.sqrt(factor):.3g} times as much as stated, and their uncertainty was increased so")
+            times = f"{np.sqrt(factor):.3g}"
+            warnings.append(f"the points scatter {times} times as much as stated, so their uncertainty was multiplied by {times}")
         if self.outlying:
             rows = ", ".join(str(i) for i in self.outlying[:SHOWN])
             more = f" and {len(self.outlying) - SHOWN} more" if len(self.outlying) > SHOWN else ""

@@ -279,7 +279,7 @@ def test_kin_that_explains_nearly_all_but_costs_more_is_listed_with_its_odds(fol
     finding = discover(job_of(folder), DiscoveryJournal(), Search(ahead=25.0), ignore_progress)
     assert finding.confounded_with == ()
     (line,) = rival_lines(finding.effects[0])
-    assert line.endswith("(10^11 times less likely, but in a slightly different form it would look the same)")
+    assert line.endswith("(10^11 times less likely, but a slightly different form of it would look the same)")
     assert any(line in told for told in lines_of(finding))
     card = shown(found_report(job_of(folder), DiscoveryJournal(), finding, "now"))["sections"][0]["blocks"][0]
     assert {"name": "What else it could be", "value": line} in card["items"]
