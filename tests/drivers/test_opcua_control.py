@@ -149,7 +149,7 @@ async def test_positions_are_read_with_unit_and_quality(plant: Plant) -> None:
         await plant.nodes["X"].write_value(uncertain)
         with pytest.raises(DeviceFault, match=r"x is not valid \(BadSensorFailure"):
             await control.status()
-        with pytest.raises(NotProved, match="no table is written"):
+        with pytest.raises(NotProved, match="Abbe writes no table"):
             await control.write_bank(0, b"")
     finally:
         await control.close()

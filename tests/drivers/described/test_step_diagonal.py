@@ -109,7 +109,7 @@ async def solved(url: str, world: World | LineWorld | LibraryMeter, tmp_path: Pa
         async with recovered_session(store, here, ask=mounts, listening=True) as session:
             with pytest.raises(ConfigError, match="Abbe can only read this control"):
                 await measure(session, store, here, plan)
-            with pytest.raises(NotProved, match="no table is written into it"):
+            with pytest.raises(NotProved, match="Abbe writes no table into it"):
                 await session.controller.write_bank(0, b"")
             await listen_campaign(session, store, here, plan, operator)
         return {record.label: load_run(store, record.id) for record in store.runs.all(title)}
