@@ -16,6 +16,9 @@ from tests.conftest import ROOT
 
 FILE = (ROOT / "deploy" / "machine.example.toml").read_text(encoding="utf-8")
 REFUSED = "error CFG-001: this system has no file locks: Abbe measures and serves on Linux only - docs/how-to/windows.md\n"
+READS = ["check-config", "measure --recipe quick-check --dry-run"]
+if os.environ.get("ABBE_TEST_LONG") == "1":
+    READS += ["version", "effects backlash", "comp formats"]
 LIBRARY = """
 import abbe
 machine = abbe.Machine("w-X-Y-b-Z-t", [[0, 600], [0, 500], [0, 450]])
@@ -47,7 +50,7 @@ def test_the_library_plans_solves_and_reports(folder: Path) -> None:
     assert "<svg" in (folder / "june.html").read_text(encoding="utf-8")
 
 
-@pytest.mark.parametrize("words", ["version", "check-config", "effects backlash", "comp formats", "measure --recipe quick-check --dry-run"])
+@pytest.mark.parametrize("words", READS)
 def test_what_only_reads_works(folder: Path, words: str) -> None:
     code, _, err = typed(folder, *words.split())
     assert code == 0, err

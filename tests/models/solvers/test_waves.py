@@ -1,5 +1,7 @@
 """Periods of screws in the displacements at the touched positions of an artefact."""
 
+import os
+
 import numpy as np
 import pytest
 
@@ -8,6 +10,7 @@ from abbe.models.solvers.waves import Displacements, peaks
 
 PITCH_MM = 56.8
 SIGMA_MM = 3e-4
+SEEDS = 6 if os.environ.get("ABBE_TEST_LONG") == "1" else 3
 
 
 def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0) -> Displacements:
@@ -25,7 +28,7 @@ def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0) ->
     return Displacements(axis, at, known @ (true + SIGMA_MM * rng.standard_normal(at.size)), known)
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(SEEDS))
 def test_two_periods_are_told_from_their_aliases(seed: int) -> None:
     found = [p for p in peaks(touched({10.0: 2.0, 40.0 / 3.0: 1.0}, seed)) if p.weight > SURE]
     assert [p.axes for p in found] == [(0, 1), (0, 1)]
@@ -33,7 +36,7 @@ def test_two_periods_are_told_from_their_aliases(seed: int) -> None:
         assert abs(p.frequency - 1.0 / period) < 3.0 * p.u_frequency
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(SEEDS))
 def test_scatter_from_position_to_position_is_no_sure_period(seed: int) -> None:
     assert max((p.weight for p in peaks(touched({}, seed, scatter_um=1.5))), default=0.0) < SURE
 
