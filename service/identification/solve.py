@@ -34,7 +34,7 @@ from abbe.service.verification.reduction import holds_at, laser_inputs
 LASER_SIGMA_MM = 3e-4
 CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
 """Prefixes of set-up unknowns that cannot be off by five uncertainties: they were calibrated, or such an error would be visible."""
-LASER_REMEDY = "look at beam, mirror and temperature of that set-up"
+LASER_REMEDY = "look at beam, mirror and temperature of that set-up, or search for a missing effect: `abbe discover`"
 UNUSUAL = {
     "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
     "bar_drift": ("the drift of the centre cup", "look at the cup's clamping, the spindle's temperature and t_s"),

@@ -138,6 +138,12 @@ def _further(test: AxisReadings, axis: str, answers: Answers) -> dict[str, Any]:
     return {name: np.full(n, value) for name, value in given.items() if value is not None} | dict(test.further)
 
 
+MATERIAL_UNKNOWN = (
+    "whether the instrument reduced the deviations to 20 °C: Abbe assumes that it did not; if it did, state its coefficient as "
+    "`laser_per_k` in the machine file"
+)
+
+
 def unknown_of(test: AxisReadings) -> list[str]:
     """Unknown facts of a test, as text for reports."""
     out = []
@@ -145,6 +151,8 @@ def unknown_of(test: AxisReadings) -> list[str]:
         out.append(f"temperature of the scale of {test.axis}: U assumes 15 to 25 °C")
     if test.quantity == "length" and not {"temp_air_C", "pressure_air_Pa"} <= set(test.further):
         out.append("temperature and pressure of the air, so how the wavelength was compensated: U assumes 15 to 25 °C, 980 to 1040 hPa")
+    if test.quantity == "length":
+        out.append(MATERIAL_UNKNOWN)
     if test.feed_mm_min is None:
         out.append("feed")
     if test.t_s is None:
