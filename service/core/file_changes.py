@@ -110,7 +110,10 @@ class FileChanges:
                 raise ConfigError(
                     f"the service may not write {old.path}: {err.strerror}", "give it the right to write this folder"
                 ) from None
-        self._context.audit.write(replace(begun, outcome="done"))
+        try:
+            self._context.audit.write(replace(begun, outcome="done"))
+        except AbbeError as error:  # the file is changed and the first record says so: the service must not go on with the old values
+            log.error("audit record failed", cause=error.detail)
         log.warning("machine file changed", who=asked.who, changes=[str(one) for one in found])
         return setup
 

@@ -17,6 +17,7 @@ from abbe.service.config import load_machine
 from abbe.service.core import file_changes
 from abbe.service.core.file_changes import FileChangeContext, FileChanges
 from abbe.service.core.setup import MachineFileSource
+from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.machine_file import FileEdit
 from abbe.service.errors import ConfigError, StoreError
 from abbe.service.storage.store import Store
@@ -173,6 +174,27 @@ async def test_without_the_audit_nothing_is_written(bench: Bench, monkeypatch: p
     monkeypatch.setattr(bench.audit, "write", broken)
     assert (await bench.ask(VALUE)).text == "the disk is full"
     untouched(bench)
+
+
+async def test_a_changed_file_is_taken_over_even_if_its_second_record_fails(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    write = bench.audit.write
+
+    def once(event: AuditEvent) -> AuditEvent:
+        if event.outcome == "done":
+            raise StoreError("the disk is full")
+        return write(event)
+
+    monkeypatch.setattr(bench.audit, "write", once)
+    assert (await bench.ask(VALUE)).outcome == "done"
+    assert [one.machine.limits.table_value_um for one in bench.begun] == [70.0]
+    assert [word for *_, word in bench.recorded()] == ["begun"]
+
+
+async def test_a_link_to_the_file_stays_a_link(bench: Bench) -> None:
+    target = bench.file.rename(bench.file.with_name("mill-7.toml"))
+    bench.file.symlink_to(target)
+    assert (await bench.ask(VALUE)).outcome == "done"
+    assert (bench.file.is_symlink(), target.read_text()) == (True, TEXT.replace("80.0", "70"))
 
 
 async def test_a_folder_that_may_not_be_written_is_named(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:

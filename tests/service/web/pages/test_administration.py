@@ -15,6 +15,7 @@ from abbe.service.machine_changes import RIGHTS, changed, section_of
 from abbe.service.rendering.phrases import LANGUAGES, is_whole
 from abbe.service.web.language import catalogue
 from abbe.service.web.login.access import route_permissions
+from abbe.service.web.pages import administration
 from abbe.service.web.pages import file_fields as fields
 from abbe.service.web.pages.file_fields import edits_of, schedule_fields, shown_fields
 from tests.pages_world import USERS, Served, as_user
@@ -152,6 +153,23 @@ def test_everybody_sees_the_values_and_only_the_right_role_a_button(running: Ser
         for form in ("laboratory", "limits", "certificates", "schedule", "read"):
             status = client.post(f"/administration/{form}", data={"password": "x"}).status_code
             assert status == (422 if form in expected else 403), form
+
+
+def test_a_file_that_may_not_be_written_is_said_and_offers_nothing(running: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(administration, "may_replace", lambda _: False)
+    for name, path in (("adam", "/machine.toml"), ("vera", "may not write machine.toml")):
+        with as_user(running, name) as client:
+            page = client.get("/administration").text
+        assert ("may not write" in page, path in page, 'type="password"' in page) == (True, True, False)
+
+
+def test_until_the_service_has_the_changed_file_its_values_are_not_called_changed(running: Served) -> None:
+    with as_user(running, "adam") as client:
+        now = re.findall(r'name="sha256" value="(\w+)"', client.get("/administration").text)[0]
+        waits, done = client.get(f"/administration?was={now}"), client.get(f"/administration?was={'0' * 64}")
+    assert ("starting anew" in waits.text, "has started anew" in waits.text, waits.headers["refresh"]) == (True, False, "2")
+    assert 'type="password"' not in waits.text
+    assert ("starting anew" in done.text, "has started anew" in done.text, "refresh" in done.headers) == (False, True, False)
 
 
 REFUSALS = (
