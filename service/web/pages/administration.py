@@ -84,10 +84,9 @@ class _Desk:
     def __init__(self, context: PageContext, stated: MachineFileSummary | None, core: CoreLine | None) -> None:
         self._context, self._stated, self._core = context, stated, core
 
-    async def take(self, request: Request, what: str, made: Made) -> Response:
+    async def take(self, request: Request, made: Made) -> Response:
         """Ask the core for the changes of a form, which the password signs; a refusal gives the reason."""
         visit: Visit = request.state.visit
-        visit.target = what
         form = await form_of(request, MOST_FIELDS, blank=True)
         if form is None or "password" not in form or "sha256" not in form:
             return problem(422, "the form needs the password and the fingerprint of the machine file")
@@ -111,27 +110,27 @@ def _add_forms(app: FastAPI, desk: _Desk) -> None:
     @app.post("/administration/laboratory", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.CONFIGURE)
     async def laboratory(request: Request) -> Response:
-        return await desk.take(request, "laboratory", lambda form, stated: edits_of(file_fields.LABORATORY, form, stated))
+        return await desk.take(request, lambda form, stated: edits_of(file_fields.LABORATORY, form, stated))
 
     @app.post("/administration/limits", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.APPROVE)
     async def limits(request: Request) -> Response:
-        return await desk.take(request, "limits", lambda form, stated: edits_of(file_fields.LIMITS, form, stated))
+        return await desk.take(request, lambda form, stated: edits_of(file_fields.LIMITS, form, stated))
 
     @app.post("/administration/certificates", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.APPROVE)
     async def certificates(request: Request) -> Response:
-        return await desk.take(request, "certificates", lambda form, stated: edits_of(file_fields.CERTIFICATES, form, stated))
+        return await desk.take(request, lambda form, stated: edits_of(file_fields.CERTIFICATES, form, stated))
 
     @app.post("/administration/schedule", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.CONFIGURE)
     async def schedule(request: Request) -> Response:
-        return await desk.take(request, "schedule", _schedule)
+        return await desk.take(request, _schedule)
 
     @app.post("/administration/read", include_in_schema=False, max_body_size=LONGEST_FORM)
     @needs(Permission.CONFIGURE)
     async def read(request: Request) -> Response:
-        return await desk.take(request, "machine file", _nothing)
+        return await desk.take(request, _nothing)
 
 
 def _schedule(form: Form, stated: MachineFileSummary) -> tuple[FileEdit, ...]:
