@@ -76,7 +76,7 @@ class Site:
         )
         self._cnc = ModbusTcp(cnc)
         self._laser: ModbusTcp | RtuLine = ModbusTcp(laser) if scenario.laser.transport == "tcp" else RtuLine(laser, self._link(LASER_LINK))
-        self._fixture = Fixture(self.world, self, self._advance_and_tick)
+        self._fixture = Fixture(self.world, self, self.advance)
 
     def _link(self, name: str) -> Path | None:
         return None if self._links is None else self._links / name
@@ -109,27 +109,26 @@ class Site:
         await self._cnc.stop()
 
     def advance(self) -> None:
-        """Bring the world up to wall time. Called before every request of the control and the laser."""
-        self.world.advance(self._scenario.speed * (asyncio.get_running_loop().time() - self._begin_s))
-
-    def _advance_and_tick(self) -> None:
-        """Bring the world up to wall time; a tick follows at once: the request may start the samples of the box."""
-        self.advance()
+        """Bring the world up to wall time. Called before every request; a tick follows at once, because the request may start a motion."""
+        self._advance()
         if self._resting and self._ticking is not None:
             self._ticking.cancel()
             self._ticking = asyncio.get_running_loop().call_soon(self._tick)
             self._resting = False
 
+    def _advance(self) -> None:
+        self.world.advance(self._scenario.speed * (asyncio.get_running_loop().time() - self._begin_s))
+
     def _tick(self) -> None:
         """Advance the world, send the samples that are due, and schedule the next tick."""
-        self.advance()
+        self._advance()
         self.box.flush()
         self._port.pump()
         self._resting = not (self.world.ballbar.rate_hz or self._port.backlog)
         self._ticking = asyncio.get_running_loop().call_later(REST_S if self._resting else TICK_S, self._tick)
 
     def _received(self, data: bytes) -> None:
-        self._advance_and_tick()
+        self.advance()
         self.box.received(data)
 
     # ---- the cable of the ball-bar's box -------------------------------------------------------------------------
