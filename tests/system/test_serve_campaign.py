@@ -37,7 +37,7 @@ pytestmark = [pytest.mark.scenario, pytest.mark.timeout(900)]
 LONG = os.environ.get("ABBE_TEST_LONG")
 NUMBER = r"([+-]?\d+(?:\.\d+)?)"
 BAR = re.compile(rf"mount the {NUMBER} mm bar", re.IGNORECASE)
-BEAM = re.compile(rf"beam along X {NUMBER}  Y {NUMBER}  Z {NUMBER},")
+BEAM = re.compile(rf"beam along X {NUMBER}  Y {NUMBER}  Z {NUMBER}")
 SET_UPS, RUNS, BARS, CHECKED = 19, 21, 3, 4
 
 
