@@ -9,6 +9,8 @@ import asyncio
 from collections.abc import Awaitable, Callable
 from dataclasses import replace
 
+import structlog
+
 from abbe.models.compensation.tables import Predicted
 from abbe.service.campaigns.measure import MeasureOptions, artefacts_of, measure, start_campaign
 from abbe.service.campaigns.plausibility import certificates, check_devices, needed_by
@@ -20,6 +22,7 @@ from abbe.service.devices.session import Session, lock_machine
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import PreconditionsChanged, TableMismatch, TableRefused
+from abbe.service.jobs.interrupted import interrupted_campaign
 from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, investigate, make_proposal, plan_for, promise_text
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
@@ -27,6 +30,7 @@ from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.tables.nine_tables import read_base
 from abbe.service.verification.alarm_states import Alarm, Note
 
+log = structlog.get_logger("abbe.campaign")
 SOLVING = "the measurement is complete, and nothing moves while it is solved"
 
 
@@ -58,6 +62,8 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
     name = context.plan.name
     context.control.now(State.RUNNING)
     await context.control.gate()
+    if resumes:
+        await _check_interrupted(context, source, name, alarm=0)
     try:
         check_certificates(context.site)
         _check_not_ended(context)
@@ -82,9 +88,6 @@ async def investigate_guided(context: InvestigationContext, source: RecipeSource
     async def measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:
         check_certificates(context.site)
         _check_not_ended(context)
-        begun_last = alarm.last(AlarmKind.BEGUN)
-        if resume and (begun_last is None or begun_last.facts.campaign != resume):
-            raise PreconditionsChanged(f"campaign {resume!r} is not the last one of alarm {alarm.number}", "start a new search")
         led = replace(context, plan=replace(context.plan, name=resume) if resume else plan_for(context, alarm))
         name = led.plan.name
 
@@ -94,6 +97,8 @@ async def investigate_guided(context: InvestigationContext, source: RecipeSource
         ids = await _measured(led, source, begun, resumes=bool(resume))
         return await note(AlarmKind.MEASURED, AlarmFacts(text=f"campaign {name!r} is measured: {len(ids)} runs", campaign=name))
 
+    if resume:
+        await _check_interrupted(context, source, resume, alarm.number)
     await investigate(context, alarm, note, measured)
 
 
@@ -115,6 +120,8 @@ async def _measured(
             await context.control.gate()
             await _check_table_acts(session)
             found = await resume_campaign(session, store, site, plan, name, None) if resumes else None
+            if found is not None:
+                log.info("campaign resumed", campaign=name, found=found.messages)
             if begins is not None:
                 await begins()
             begun = await start_campaign(session, store, site, name, artefacts_of(plan)) if found is None else found.campaign
@@ -124,10 +131,23 @@ async def _measured(
                     session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
                 )
             except BaseException as error:
-                kept = f"completed runs of campaign {name!r} are kept; the screen of a new measurement resumes it"
+                on_page = (
+                    "; the screen of a new measurement resumes it" if source.text is None else ""
+                )  # recipe files are not offered there
+                kept = f"completed runs of campaign {name!r} are kept{on_page}"
                 typed = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
                 error.add_note(f"{kept}; {typed}")
                 raise
+
+
+async def _check_interrupted(context: InvestigationContext, source: RecipeSource, name: str, alarm: int) -> None:
+    """Refuse to resume another campaign than the last one of its recipe, a complete one, or that of another alarm."""
+    found = await asyncio.to_thread(interrupted_campaign, context.store, context.site.name, source.recipe)
+    if found is None or found.name != name:
+        raise PreconditionsChanged(f"campaign {name!r} is complete, or is not the last one of its recipe", "start a new campaign")
+    if found.alarm != alarm:
+        whose = f"looks for the cause of alarm {found.alarm}" if found.alarm else f"does not look for the cause of alarm {alarm} any more"
+        raise PreconditionsChanged(f"campaign {name!r} {whose}", "start again on the screen of a new measurement")
 
 
 async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:

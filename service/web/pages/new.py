@@ -14,8 +14,8 @@ from pydantic import AfterValidator
 
 from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import Rules
+from abbe.service.jobs.interrupted import interrupted_campaign
 from abbe.service.queries.alarms import path_of_alarm
-from abbe.service.queries.interrupted import interrupted_campaign
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.users.roles import Permission
 from abbe.service.web import language
@@ -44,7 +44,9 @@ def add_new_page(app: FastAPI, context: PageContext, plans: Rehearsals) -> None:
         rate_hz = rate_hz if rate_hz in plans.rates_hz else USUAL_HZ
         choices = plans.choices()
         chosen = recipe if recipe in choices else next(iter(choices), "")
-        interrupted = await context.read(interrupted_campaign, context.reader, chosen) if chosen == CAMPAIGN else None
+        interrupted = (
+            await context.read(interrupted_campaign, context.reader.store, context.reader.machine, chosen) if chosen == CAMPAIGN else None
+        )
         resumes = interrupted is not None and interrupted.name == resume
         if interrupted is not None and resumes:
             rate_hz, alarm = interrupted.rate_hz, interrupted.alarm

@@ -111,7 +111,7 @@ async function showEnd() {
     find(id).hidden = !number;
     find(id).querySelector("a").href = `/${screen}?id=${number}`;
   }
-  find("live-again").hidden = ended?.kind !== "campaign" || Boolean(ended.proposal || ended.alarm);
+  find("live-again").hidden = ended?.kind !== "campaign" || !["done: stopped", "done: failed"].includes(ended.state) || Boolean(ended.alarm);
   setText("live-state", words["measuring.ended"]);
   find("live-over").hidden = false;
 }

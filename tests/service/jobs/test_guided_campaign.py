@@ -9,8 +9,8 @@ import asyncio
 import json
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager, nullcontext
-from dataclasses import asdict
-from datetime import date
+from dataclasses import asdict, replace
+from datetime import UTC, date, datetime
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -27,6 +27,7 @@ from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, Al
 from abbe.service.errors import Aborted, NotObservable, PreconditionsChanged, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work
 from abbe.service.jobs import investigate
+from abbe.service.jobs.interrupted import InterruptedCampaign
 from abbe.service.jobs.investigate import InvestigationContext
 from abbe.service.sequences.control import Control, State, Watching
 from abbe.service.sequences.recipes.campaigns import RecipeSource, campaign_source
@@ -202,7 +203,7 @@ async def test_a_person_is_told_where_the_spindle_stands_and_a_stop_ends_the_wai
 async def test_what_is_broken_off_tells_how_it_is_resumed_and_what_resumes_begins_no_campaign(
     resumes: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    told_by_resume = SimpleNamespace(campaign=(4, 0))
+    told_by_resume = SimpleNamespace(campaign=(4, 0), messages=())
     begun: list[object] = []
 
     @asynccontextmanager
@@ -235,7 +236,7 @@ async def test_what_is_broken_off_tells_how_it_is_resumed_and_what_resumes_begin
     bench.live = None
     bench.control.now(State.RUNNING)
     with pytest.raises(Stopped) as told:
-        await work._measured(bench, {}, resumes=resumes)  # type: ignore[arg-type]
+        await work._measured(bench, RecipeSource(recipe="identification"), resumes=resumes)
     assert begun == [((4, 0), told_by_resume) if resumes else ((7, 0), None)]
     (note,) = told.value.__notes__
     assert "abbe measure -m MACHINE.toml --resume 'full 1'" in note
@@ -277,11 +278,26 @@ async def test_the_cause_of_an_alarm_is_measured_with_a_person_and_its_lines_com
     assert lines.lines[3].facts.text.endswith("is measured: 2 runs")
 
 
-async def test_a_stopped_search_resumes_its_own_campaign_and_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+NOON = InterruptedCampaign(
+    name="of noon", recipe="identification", rate_hz=100, complete=3, until_utc=datetime(2026, 11, 28, 12, tzinfo=UTC), alarm=1
+)  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("found", "why"),
+    [
+        (NOON, ""),
+        (None, "is complete, or is not the last one of its recipe"),
+        (replace(NOON, name="of evening"), "is complete, or is not the last one of its recipe"),
+        (replace(NOON, alarm=2), "looks for the cause of alarm 2"),
+        (replace(NOON, alarm=0), "does not look for the cause of alarm 1 any more"),
+    ],
+)
+async def test_a_stopped_search_resumes_its_own_campaign_and_no_other(
+    found: InterruptedCampaign | None, why: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     lines = Lines()
-    await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
-    await lines.note(AlarmKind.BEGUN, AlarmFacts(campaign="alarm 1 of noon"))
-    alarm = await lines.note(AlarmKind.ORDERED, AlarmFacts(name="petra"))
+    alarm = await lines.note(AlarmKind.RAISED, AlarmFacts(text="too far off"))
     seen: list[tuple[str, bool]] = []
 
     async def led(context: Any, source: Any, begins: Any, *, resumes: bool) -> list[int]:
@@ -289,12 +305,18 @@ async def test_a_stopped_search_resumes_its_own_campaign_and_no_other(monkeypatc
         raise Stopped("by a person", "")
 
     monkeypatch.setattr(work, "_measured", led)
+    monkeypatch.setattr(work, "interrupted_campaign", lambda *_: found)
     bench: Any = InvestigationContext(pretended().site, None, CampaignPlan("", ()), SystemClock(), ignore_progress)  # type: ignore[arg-type]
-    with pytest.raises(Stopped):
-        await work.investigate_guided(bench, {}, alarm, lines.note, resume="alarm 1 of noon")  # type: ignore[arg-type]
-    with pytest.raises(PreconditionsChanged, match="is not the last one of alarm 1"):
-        await work.investigate_guided(bench, {}, alarm, lines.note, resume="alarm 1 of morning")  # type: ignore[arg-type]
-    assert seen == [("alarm 1 of noon", True)]
+    with pytest.raises(PreconditionsChanged, match=why) if why else pytest.raises(Stopped):
+        await work.investigate_guided(bench, RecipeSource(recipe="identification"), alarm, lines.note, resume="of noon")
+    assert seen == ([] if why else [("of noon", True)])
+
+
+async def test_a_campaign_that_is_not_interrupted_is_not_resumed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delattr(work, "_measured")
+    monkeypatch.setattr(work, "interrupted_campaign", lambda *_: None)
+    with pytest.raises(PreconditionsChanged, match="campaign 'full 1' is complete, or is not the last one of its recipe"):
+        await work.run_guided_campaign(pretended(), RecipeSource(recipe="identification"), "bob", resumes=True)
 
 
 async def test_without_certificates_no_cause_is_measured(monkeypatch: pytest.MonkeyPatch) -> None:

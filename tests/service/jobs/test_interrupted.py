@@ -8,11 +8,9 @@ from pathlib import Path
 
 import pytest
 
-from abbe.service.clock import SystemClock
 from abbe.service.domain.measured import this_process
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
-from abbe.service.queries.interrupted import InterruptedCampaign, interrupted_campaign
-from abbe.service.queries.reader import Reader
+from abbe.service.jobs.interrupted import InterruptedCampaign, interrupted_campaign
 from abbe.service.sequences.journal import BEGUN, ENDED
 from abbe.service.storage.store import Store
 
@@ -26,7 +24,6 @@ class Shop:
     def __init__(self, store: Store) -> None:
         self.store = store
         self.machine = store.machines.add(MILL, {})
-        self.reader = Reader(store, MILL, SystemClock())
 
     def campaign(self, name: str, recipe: str = RECIPE, *, how: str = "stopped", complete: int = 2, owner: dict | None = None) -> None:
         """``how``: how it ended, empty while it is measured; ``owner``: its process."""
@@ -41,7 +38,7 @@ class Shop:
             self.store.checkpoints.add(number, ENDED, {"how": how})
 
     def found(self) -> InterruptedCampaign | None:
-        return interrupted_campaign(self.reader, RECIPE)
+        return interrupted_campaign(self.store, MILL, RECIPE)
 
 
 @pytest.fixture

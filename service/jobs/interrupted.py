@@ -7,9 +7,9 @@ from datetime import datetime
 
 from abbe.service.domain.measured import CheckpointRecord
 from abbe.service.domain.service_records import AlarmKind
-from abbe.service.queries.reader import Reader
 from abbe.service.sequences.journal import BEGUN, ENDED, BegunLine, lines_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
+from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import Alarm, folded, step_of_order
 
 LATEST = 20
@@ -33,25 +33,25 @@ class InterruptedCampaign:
     alarm: int
 
 
-def interrupted_campaign(reader: Reader, recipe: str) -> InterruptedCampaign | None:
-    """Return this machine's last campaign of a recipe; None if it was completed, is being measured, or has no complete run."""
-    for row in reader.page("campaigns", {"machine": reader.machine}, None, LATEST)[0]:
-        journal = reader.store.checkpoints.of_campaign(row.number)
+def interrupted_campaign(store: Store, machine: str, recipe: str) -> InterruptedCampaign | None:
+    """Return a machine's last campaign of a recipe; None if it was completed, is being measured, or has no complete run."""
+    for row in store.pages.page("campaigns", {"machine": machine}, None, LATEST):
+        journal = store.checkpoints.of_campaign(row.number)
         begun = lines_of(journal, BegunLine)
         source = RecipeSource(**begun[-1].source) if begun and "recipe" in begun[-1].source else None
         if source is None or source.recipe != recipe:
             continue
-        complete = sum(run.visible_status == COMPLETE for run in reader.store.runs.all(row.number))
+        complete = sum(run.visible_status == COMPLETE for run in store.runs.all(row.number))
         if not complete or not _is_interrupted(journal, begun[-1]):
             return None
-        campaign = reader.store.campaigns.find(row.number).name
+        campaign = store.campaigns.find(row.number).name
         return InterruptedCampaign(
             name=campaign,
             recipe=recipe,
             rate_hz=source.rate_hz,
             complete=complete,
             until_utc=datetime.fromisoformat(journal[-1].utc),
-            alarm=next((one.number for one in folded(reader.store.alarms.entries(reader.machine)) if _looks_for(one, campaign)), 0),
+            alarm=next((one.number for one in folded(store.alarms.entries(machine)) if _looks_for(one, campaign)), 0),
         )
     return None
 
