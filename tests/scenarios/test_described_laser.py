@@ -40,7 +40,7 @@ async def report_beside(sims, urls, described):
         await session.need_fixture().mount_laser((1.0, 0.0, 0.0))
 
         async def person(text: str) -> None:
-            if "Block" in text or "Free" in text:
+            if "Block" in text or "Clear the beam" in text:
                 sims.ask("beam", blocked="Block" in text)
             else:
                 x = 310.0 if "AWAY" in text else 300.0

@@ -159,8 +159,8 @@ def test_all_that_is_wrong_is_one_line(refuses: Refuses) -> None:
 def test_a_console_without_a_person_is_found_before_the_machine_goes_to_the_first_place(
     sims: Sims, tmp_path: Path, refuses: Refuses
 ) -> None:
-    assert "the console is unattended" in refuses("quick-check", fixture="fixture+console:")
+    assert "nobody is at the console" in refuses("quick-check", fixture="fixture+console:")
     config = load_machine(machine_file(sims, tmp_path, {"fixture": "fixture+console:"})).machine
-    with Store.open(f"sqlite:///{tmp_path / 'night.sqlite3'}") as store, pytest.raises(ConfigError, match="the console is unattended"):
+    with Store.open(f"sqlite:///{tmp_path / 'night.sqlite3'}") as store, pytest.raises(ConfigError, match="nobody is at the console"):
         asyncio.run(run_check(config, store, "quick-check", ignore_progress))
     assert told(sims) == []

@@ -255,7 +255,7 @@ async def test_a_push_cut_short_before_it_was_kept_is_taken_back_at_the_next_sta
         assert last(store) == state
         if state is PushState.PROBED:  # whoever looks now sees the new table; it is not that one which is vouched for
             said = await accept(session.controller, store, site)
-            assert "was made active again" in said
+            assert "is active again" in said
             assert "nothing was accepted" in said
         else:
             assert "made active again" in await recover(session.controller, store, site)
