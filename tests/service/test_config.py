@@ -153,19 +153,23 @@ BAD = [
     (
         'cron = "0 3 * * *"',
         'cron = "0 3 * * *"\nevery_h = 0',
-        r"schedule\[1\]: expected cron without every_h, first, .*, got cron, every_h",
+        r"schedule\[1\]: expected either cron, or every_h, first, got cron, every_h",
     ),
-    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nfirst = 2026-01-01T00:00:00Z', r"schedule\[1\]: expected cron .*, got cron, first"),
-    ('cron = "0 3 * * *"', 'cron = ""\nevery_h = 6', r"schedule\[1\]: expected cron .*, got cron, every_h - remove every_h or cron"),
+    ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nfirst = 2026-01-01T00:00:00Z', r"schedule\[1\]: expected either cron, .*, got cron, first"),
+    (
+        'cron = "0 3 * * *"',
+        'cron = ""\nevery_h = 6',
+        r"schedule\[1\]: expected either cron, .*, got cron, every_h - remove every_h or cron",
+    ),
     (
         "[[schedule]]",
         '[[staffed]]\nname="m"\ndays=["fri"]\nstart=22:00:00\nend=06:00:00\nhours=0\n[[schedule]]',
-        r"staffed\[1\]: expected cron and hours without days, start, end, .*, got hours, days, start, end",
+        r"staffed\[1\]: expected either cron and hours, or days, start, end, got hours, days, start, end",
     ),
     (
         "[[schedule]]",
         '[[maintenance]]\nname="m"\ncron="0 3 * * *"\nhours=2\ndays=[]\n[[schedule]]',
-        r"maintenance\[1\]: expected cron and hours .*, got cron, hours, days",
+        r"maintenance\[1\]: expected either cron and hours, .*, got cron, hours, days",
     ),
     ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\ncatch_up = "all"', r"schedule\[1\].catch_up: expected 'skip' or 'once'"),
     ('cron = "0 3 * * *"', 'cron = "0 3 * * *"\nneeds = { warm = 3 }', r"unknown key 'schedule\[1\].needs.warm'"),

@@ -202,6 +202,8 @@ def test_a_dry_run() -> None:
         "guided": False,
         "alarm": 0,
         "begins": None,
+        "interrupted": None,
+        "resumes": False,
         "key": "k",
         "expired": [],
         "temperature_c": None,

@@ -90,6 +90,8 @@ def test_the_screen_counts_the_set_ups() -> None:
         "guided": False,
         "alarm": 0,
         "begins": None,
+        "interrupted": None,
+        "resumes": False,
         "key": "k",
         "expired": [],
         "temperature_c": None,
