@@ -202,8 +202,8 @@ class NewJob(RequestBody):
         str,
         Field(
             max_length=WORD,
-            description="The last full campaign of this recipe, if it was interrupted: complete runs are kept, every other set-up is mounted "
-            "anew. Whoever asks for it states that nothing was repaired, adjusted or moved at the machine since",
+            description="The last full campaign of this recipe, if it was interrupted: complete runs are kept, every other set-up is "
+            "mounted anew. Whoever asks for it states that nothing was repaired, adjusted or moved at the machine since",
         ),
     ] = ""
 
