@@ -22,7 +22,7 @@ from abbe.service.scheduler.job import FollowUp, FollowUps, RunJob, carry_out
 from abbe.service.scheduler.outcomes import Hindrance, Waiting, busy, maintenance, not_ready
 from abbe.service.scheduler.ports import Doc, Readiness, SlotLedger, SlotState
 from abbe.service.scheduler.ready import AlwaysReady
-from abbe.service.scheduler.slots import covering, next_slot, previous_slot, slots_after
+from abbe.service.scheduler.slots import covering, next_slot, previous_slot, slots_after, time_rule
 from abbe.service.sequences.control import Control
 
 log = structlog.get_logger("abbe.scheduler")
@@ -125,10 +125,12 @@ class Scheduler:
     async def run(self) -> None:
         """Work forever. Cancelling stops a running job by its own cancellation, waits for it, and releases the waiting slots."""
         now = self._clock.utc()
+        since = await self._ledger.in_force_since({one.name: time_rule(one) for one in self._schedules}, now)
         for schedule in self._schedules:
-            # From the last known slot on: slots that came due while the service was off are recorded.
+            # From the last known slot on: slots that came due while the service was off are recorded. A changed time rule was not in force
+            # then: its slots before the change were never due.
             last = await self._ledger.last_claimed(schedule.name)
-            self._move_cursor(schedule, now if last is None else min(last, now))
+            self._move_cursor(schedule, now if last is None else min(max(last, since[schedule.name]), now))
         self._adopt_at_s = self._clock.monotonic_s()
         try:
             async with asyncio.TaskGroup() as tasks:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple, Protocol, Self
 
@@ -76,6 +76,11 @@ class SlotLedger(Protocol):
         """Record the outcome of a claimed slot: state (at most 30 characters) and its sentence."""
         ...
 
+    async def in_force_since(self, rules: Mapping[str, str], now: datetime) -> dict[str, datetime]:
+        """Return since when each schedule has its present time rule: ``now`` for a new or changed one. ``rules``: by name; others are
+        forgotten."""
+        ...
+
     async def last_claimed(self, schedule: str) -> datetime | None:
         """Return the latest slot ever claimed for this schedule, or None if it is new."""
         ...
@@ -90,6 +95,10 @@ class Readiness(Protocol):
 
     async def watch(self) -> None:
         """Record the machine's state forever if a precondition needs its history; otherwise return at once."""
+        ...
+
+    def continue_from(self, earlier: Readiness) -> None:
+        """Take over the history of the machine that the service had before it started anew."""
         ...
 
 

@@ -12,6 +12,7 @@ from abbe.service.clock import Clock
 from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.errors import AbbeError
+from abbe.service.scheduler.ports import Readiness
 from abbe.service.scheduler.slots import covering
 from abbe.service.sequences.control import person_may_be_inside, tripped
 
@@ -72,8 +73,8 @@ class Ready:
         self._air_c = air_c
         self._staffed = tuple(staffed)
         self._clock = clock
-        self._active: deque[float] = deque()
-        self._position: tuple[float, ...] | None = None
+        self.active_s: deque[float] = deque()
+        self.position_mm: tuple[float, ...] | None = None
 
     async def lack(self, schedule: Schedule) -> str:
         """Return the unmet precondition as one sentence, or an empty text. The devices are read only if a precondition needs them."""
@@ -113,9 +114,9 @@ class Ready:
 
     def active_min(self) -> float:
         """Return the number of minutes of the last 60 in which the machine was seen at work."""
-        while self._active and self._active[0] <= self._clock.monotonic_s() - HOUR_S:
-            self._active.popleft()
-        return len(self._active) * LOOK_S / 60.0
+        while self.active_s and self.active_s[0] <= self._clock.monotonic_s() - HOUR_S:
+            self.active_s.popleft()
+        return len(self.active_s) * LOOK_S / 60.0
 
     async def watch(self) -> None:
         """Read the controller each minute, forever, if a schedule needs a warm machine. A failed reading does not count as work."""
@@ -123,14 +124,19 @@ class Ready:
             try:
                 self._note((await self._look(False)).status)
             except (DriverError, AbbeError, OSError):
-                self._position = None
+                self.position_mm = None
             await self._clock.sleep(LOOK_S)
 
+    def continue_from(self, earlier: Readiness) -> None:
+        """Take over when the machine was seen at work."""
+        if isinstance(earlier, Ready):
+            self.active_s, self.position_mm = earlier.active_s, earlier.position_mm
+
     def _note(self, status: ControllerStatus) -> None:
-        before, self._position = self._position, tuple(status.position_mm)
-        moved = before is not None and max(abs(a - b) for a, b in zip(before, self._position, strict=True)) > MOVED_MM
+        before, self.position_mm = self.position_mm, tuple(status.position_mm)
+        moved = before is not None and max(abs(a - b) for a, b in zip(before, self.position_mm, strict=True)) > MOVED_MM
         if moved or status.conditions & WARMS:
-            self._active.append(self._clock.monotonic_s())
+            self.active_s.append(self._clock.monotonic_s())
 
 
 class AlwaysReady:
@@ -142,3 +148,6 @@ class AlwaysReady:
 
     async def watch(self) -> None:
         """Return at once."""
+
+    def continue_from(self, earlier: Readiness) -> None:
+        """Know no history."""

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+import json
+from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
 from typing import ParamSpec, TypeVar
 
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.schedule import FIRST_UTC
 from abbe.service.errors import StoreError
 from abbe.service.scheduler.ports import Doc, OpenSlot
 from abbe.service.storage.repositories.service_records import RUNNING
@@ -75,6 +77,18 @@ class StoreLedger(RetryingStore):
     async def finish(self, schedule: str, slot_utc: datetime, state: str, reason: str = "") -> None:
         """Record the outcome of a claimed slot: state (at most 30 characters) and its sentence."""
         await self._write(self._store.slots.finish, self._key(schedule), slot_utc, state[:30], reason)
+
+    async def in_force_since(self, rules: Mapping[str, str], now: datetime) -> dict[str, datetime]:
+        """Return since when each schedule has its present time rule: ``now`` for a new or changed one. ``rules``: by name; others are
+        forgotten."""
+        key = f"/{self._machine}"  # begins as no schedule's key does; one row, changed in place
+        rows = await self._read(self._store.slots.latest, key, 1)
+        known = json.loads(rows[0].reason or "{}") if rows else {}
+        kept = {name: known[name] if known.get(name, [""])[0] == rule else [rule, now.isoformat()] for name, rule in rules.items()}
+        if kept != known:
+            await self._write(self._store.slots.claim, key, FIRST_UTC)
+            await self._write(self._store.slots.finish, key, FIRST_UTC, "timetable", json.dumps(kept))
+        return {name: datetime.fromisoformat(at) for name, (_, at) in kept.items()}
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         """Return the latest slot ever claimed for this schedule, or None if it is new."""

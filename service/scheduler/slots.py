@@ -75,6 +75,11 @@ def slots_between(schedule: Schedule, after_utc: datetime, until_utc: datetime) 
         yield slot
 
 
+def time_rule(schedule: Schedule) -> str:
+    """Return what decides when a schedule is due, as one text: schedules with the same text have the same slots."""
+    return f"{schedule.cron}|{schedule.timezone}|{schedule.every_h:.17g}|{schedule.first.astimezone(UTC).isoformat()}"
+
+
 def rule_as_text(schedule: Schedule) -> str:
     """Return the schedule as a sentence, for people."""
     if schedule.every_h:

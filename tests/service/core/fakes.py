@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import heapq
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
 from itertools import count
@@ -14,6 +14,7 @@ from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.job import Job
 from abbe.service.scheduler.ports import OpenSlot, SlotState
+from abbe.service.scheduler.slots import time_rule
 from abbe.service.sequences.control import Control
 
 
@@ -70,6 +71,7 @@ class FakeLedger:
         self.states: dict[tuple[str, datetime], str] = {}
         self.reasons: dict[tuple[str, datetime], str] = {}
         self.nobodys: set[tuple[str, datetime]] = set()
+        self.rules: dict[str, tuple[str, datetime]] = {}
 
     async def claim(self, schedule: str, slot_utc: datetime) -> bool:
         if (schedule, slot_utc) in self.states:
@@ -112,6 +114,16 @@ class FakeLedger:
         assert len(state) <= 30
         self.states[schedule, slot_utc] = state
         self.reasons[schedule, slot_utc] = reason
+
+    async def in_force_since(self, rules: Mapping[str, str], now: datetime) -> dict[str, datetime]:
+        known = self.rules
+        self.rules = {name: known[name] if known.get(name, ("",))[0] == rule else (rule, now) for name, rule in rules.items()}
+        return {name: at for name, (_, at) in self.rules.items()}
+
+    def of_earlier(self, schedule: Schedule, slot: datetime) -> None:
+        """An earlier service had this schedule and ran this slot."""
+        self.rules[schedule.name] = (time_rule(schedule), slot)
+        self.states[schedule.name, slot] = "done: pass"
 
     async def last_claimed(self, schedule: str) -> datetime | None:
         return max((slot for name, slot in self.states if name == schedule), default=None)

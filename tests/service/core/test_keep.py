@@ -55,6 +55,20 @@ async def test_slots_survive_the_process(url: str) -> None:
         assert await StoreLedger(store, NoWait(), "mill-8").claim("weekly", SLOT)
 
 
+async def test_a_time_rule_is_known_across_services_until_it_changes(url: str) -> None:
+    then, later = SLOT, utc(2026, 6, 3, 4)
+    with Store.open(url) as store:
+        ledger = StoreLedger(store, NoWait(), "mill-7")
+        assert await ledger.in_force_since({"weekly": "a", "daily": "b"}, then) == {"weekly": then, "daily": then}
+        assert await StoreLedger(store, NoWait(), "mill-8").in_force_since({"weekly": "a"}, later) == {"weekly": later}
+    with Store.open(url) as store:
+        ledger = StoreLedger(store, NoWait(), "mill-7")
+        assert await ledger.in_force_since({"weekly": "a", "daily": "c"}, later) == {"weekly": then, "daily": later}
+        assert await ledger.in_force_since({"daily": "c"}, then) == {"daily": later}
+        assert await ledger.in_force_since({"weekly": "a"}, later) == {"weekly": later}, "it was away meanwhile"
+        assert (store.slots.counts("mill-7"), store.slots.not_run("mill-7")) == ({}, []), "no slot of the timetable"
+
+
 async def test_two_processes_race_for_slots(store: Store, url: str) -> None:
     slots = [utc(2026, 6, 1 + day, hour) for day in range(5) for hour in range(20)]
     won: list[list[bool]] = [[], []]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from dataclasses import replace
 from datetime import datetime, timedelta
 
 import pytest
@@ -91,13 +92,46 @@ async def test_after_the_service_was_off(off: timedelta, ran: int, missed: int) 
     """A minute late still runs; hours late is written down as missed, each slot of it, and announced."""
     ledger = FakeLedger()
     first = utc(2026, 6, 2, 0, 30)
-    ledger.states["nightly", first] = "done: pass"
+    ledger.of_earlier(NIGHTLY, first)
     bench = Bench(first + timedelta(days=1) + off, NIGHTLY, ledger=ledger)
     async with bench.working():
         await settle()
         assert len(bench.ran) == ran
         assert len(ledger.of("missed")) == missed
         assert bench.codes() == ["SCH-001"] * missed
+
+
+CHANGED = (
+    Schedule("nightly", "28 0 * * *", "UTC", "verify"),
+    Schedule("nightly", "0 * * * *", "UTC", "verify"),
+    Schedule("nightly", "0 * * * *", "UTC", "verify", catch_up="once"),
+    replace(NIGHTLY, timezone="Europe/London"),
+)
+
+
+@pytest.mark.parametrize("changed", CHANGED)
+@pytest.mark.parametrize("again", [False, True])
+async def test_a_changed_time_rule_has_no_slots_before_its_change(changed: Schedule, again: bool) -> None:
+    """Nothing starts because a time of today was set that is over, and no slot is called missed that never was one."""
+    ledger, now = FakeLedger(), utc(2026, 6, 5, 0, 30, 30)
+    ledger.of_earlier(NIGHTLY, utc(2026, 6, 2, 0, 30))
+    for _ in range(1 + again):  # the service starts anew with each further change of the file
+        bench = Bench(now, changed, ledger=ledger)
+        async with bench.working():
+            await bench.clock.pass_time(60)
+            assert (bench.ran, ledger.of("missed"), bench.codes()) == ([], [], [])
+        now += timedelta(minutes=2)
+
+
+async def test_a_schedule_that_was_away_for_a_while_missed_nothing() -> None:
+    ledger = FakeLedger()
+    ledger.of_earlier(NIGHTLY, utc(2026, 6, 2, 0, 30))
+    async with Bench(utc(2026, 6, 2, 8), ledger=ledger).working():
+        await settle()
+    bench = Bench(utc(2026, 6, 5, 8), NIGHTLY, ledger=ledger)
+    async with bench.working():
+        await settle()
+        assert (bench.ran, ledger.of("missed"), bench.codes()) == ([], [], [])
 
 
 async def test_a_new_schedule_starts_with_its_next_slot() -> None:

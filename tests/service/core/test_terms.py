@@ -14,7 +14,8 @@ from abbe.drivers.api import Condition, ControllerStatus
 from abbe.drivers.errors import LinkDown
 from abbe.service.domain.schedule import Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
-from abbe.service.scheduler.ready import DeviceReadings, Ready
+from abbe.service.scheduler.ports import Readiness
+from abbe.service.scheduler.ready import AlwaysReady, DeviceReadings, Ready
 from abbe.service.scheduler.slots import covers, next_slot, previous_slot, rule_as_text, slots_between
 from tests.pretended_status import READY, controller_status
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
@@ -39,6 +40,9 @@ class Bench:
     async def watch(self) -> None:
         return
 
+    def continue_from(self, earlier: Readiness) -> None:
+        return
+
     async def job(self, schedule: Schedule, slot: datetime) -> str:
         self.ran.append((slot, self.clock.utc()))
         await self.clock.sleep(600.0)
@@ -61,7 +65,7 @@ class Bench:
 
 async def test_after_three_days_off_one_run_stands_for_all() -> None:
     ledger = FakeLedger()
-    ledger.states["hourly", utc(2026, 6, 1, 6)] = "done: pass"
+    ledger.of_earlier(ONCE, utc(2026, 6, 1, 6))
     bench = Bench(utc(2026, 6, 4, 6, 30), ONCE, ledger=ledger)
     async with bench.working():
         await bench.clock.pass_time(1200)
@@ -230,10 +234,29 @@ async def test_nobody_is_looked_at_without_need() -> None:
     assert await ready.lack(HOURLY) == ""
 
 
+async def test_a_warm_machine_stays_warm_when_the_service_starts_anew() -> None:
+    clock, warm = FakeClock(MONDAY_8), replace(HOURLY, needs=Needs(warm_min=3.0))
+
+    async def look(with_air: bool) -> DeviceReadings:
+        return DeviceReadings(status(READY | Condition.SPINDLE))
+
+    ready = Ready(look, [warm], (18.0, 24.0), (), clock)
+    watching = asyncio.create_task(ready.watch())
+    await clock.pass_time(240)
+    watching.cancel()
+    following = Ready(look, [warm], (18.0, 24.0), (), clock)
+    assert await following.lack(warm) != ""
+    following.continue_from(AlwaysReady())
+    assert await following.lack(warm) != ""
+    following.continue_from(ready)
+    assert await following.lack(warm) == ""
+
+
 async def test_too_many_missed_slots_are_one_line_with_its_reason() -> None:
     ledger = FakeLedger()
-    ledger.states["fast", utc(2026, 6, 1)] = "done: pass"
-    bench = Bench(utc(2026, 6, 4), Schedule("fast", "* * * * *", "UTC", "r"), ledger=ledger)
+    fast = Schedule("fast", "* * * * *", "UTC", "r")
+    ledger.of_earlier(fast, utc(2026, 6, 1))
+    bench = Bench(utc(2026, 6, 4), fast, ledger=ledger)
     async with bench.working():
         await settle()
     assert ledger.of("missed: whole span") == [utc(2026, 6, 1, 0, 1)]

@@ -24,6 +24,7 @@ import structlog
 
 from abbe.service.domain.schedule import FIRST_UTC, Needs, Schedule, Window
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
+from abbe.service.scheduler.ports import Readiness
 from abbe.service.scheduler.slots import covering, slots_between
 from tests.service.core.cron_oracle import Minutes
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, settle, utc
@@ -102,6 +103,9 @@ class World:
         return "the machine is not idle: an NC program runs" if schedule.needs.idle and at_work(self.clock.utc()) else ""
 
     async def watch(self) -> None:
+        return
+
+    def continue_from(self, earlier: Readiness) -> None:
         return
 
     async def job(self, schedule: Schedule, slot: datetime) -> str:
