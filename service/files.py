@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import stat
+import tempfile
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -94,13 +95,15 @@ def is_plain(path: Path) -> bool:
 def replace_file(path: Path, body: bytes) -> None:
     """Replace a file at once and for good: after a power cut it is the old or the new one. Its rights, and where possible its owner, stay.
 
-    A link stays a link: the file that it leads to is replaced. Raises OSError: the old file is untouched.
+    A link stays a link: the file that it leads to is replaced. Raises OSError: the old file is untouched. A folder that cannot be
+    flushed is no error: the new file is in place, and a power cut in the next seconds may bring the old one back.
     """
     target = path.resolve()
     known = target.stat()
-    beside = target.with_name(f".{target.name}.new")
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".new", dir=target.parent)  # a new file, never one behind a link
+    beside = Path(name)
     try:
-        with beside.open("wb") as file:
+        with open(handle, "wb") as file:
             os.fchmod(file.fileno(), known.st_mode & 0o7777)
             with suppress(OSError):  # only root gives a file to another owner
                 os.fchown(file.fileno(), -1, known.st_gid)
@@ -113,11 +116,12 @@ def replace_file(path: Path, body: bytes) -> None:
         with suppress(OSError):
             beside.unlink()
         raise
-    folder = os.open(target.parent, os.O_RDONLY)
-    try:
-        os.fsync(folder)
-    finally:
-        os.close(folder)
+    with suppress(OSError):
+        folder = os.open(target.parent, os.O_RDONLY)
+        try:
+            os.fsync(folder)
+        finally:
+            os.close(folder)
 
 
 def may_replace(path: Path) -> bool:

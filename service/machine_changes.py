@@ -6,8 +6,10 @@ The file stays the only owner of its values: a change edits its text, and the pa
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+import re
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from datetime import date
 from types import MappingProxyType
 from typing import Any, Literal
 
@@ -29,7 +31,7 @@ RIGHTS: Mapping[str, Permission] = MappingProxyType(
     }
 )
 """Sections that can be changed, with the right for it. Addresses, geometry, store, page, keys and users' rights cannot."""
-Looser = Literal["more", "less", "wider", "added", "later", "stated"]
+Looser = Literal["more", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
 LOOSER: Mapping[str, Looser] = MappingProxyType(
     {
         **dict.fromkeys(
@@ -57,10 +59,37 @@ LOOSER: Mapping[str, Looser] = MappingProxyType(
         "calibration.artefact": "later",
         "calibration.room": "later",
         "calibration.room_temperature_c": "stated",
+        # When, how often and under which conditions the machine moves without a person.
+        **dict.fromkeys((f"schedule.{key}" for key in ("recipe", "cron", "timezone", "every_h", "first")), "changed"),
+        "schedule.grace_s": "more",
+        "schedule.catch_up": "raised",
+        "schedule.on_alarm": "raised",
+        "schedule.needs.idle": "less",
+        "schedule.needs.warm_min": "less",
+        "schedule.needs.air": "less",
+        "schedule.needs.operator": "dropped",
+        "schedule.name": "stated",
     }
 )
 """What makes a value allow more than before. ``more``, ``less``: a larger, a smaller one; ``wider``: a range that leaves the old one, or
-none any more; ``added``: further entries; ``later``: a later day, or a first one; ``stated``: any value that is stated."""
+none any more; ``added``: further entries; ``later``: a later day, or a first one; ``stated``: any value that is stated; ``changed``: any
+other one; ``raised``: any other one but those of `UNRAISED`; ``dropped``: any other one than before, unless that was ``any``. A new
+schedule allows more by its name, a removed one nothing."""
+UNRAISED = ("skip", "none")
+_IS_LOOSER: Mapping[Looser, Callable[[Any, Any], bool]] = MappingProxyType(
+    {
+        "more": lambda old, new: new > old,
+        "less": lambda old, new: new < old,
+        "added": lambda old, new: not set(new) <= set(old),
+        "wider": lambda old, new: old is not None and (new is None or new[0] < old[0] or new[1] > old[1]),
+        "later": lambda old, new: new is not None and (old is None or new > old),
+        "stated": lambda old, new: new is not None,
+        "changed": lambda old, new: new != old,
+        "raised": lambda old, new: new != old and new not in UNRAISED,
+        "dropped": lambda old, new: old not in (new, "any"),
+    }
+)
+NUMBERED = re.compile(r"schedule\[([1-9]\d*)\]\.")
 
 
 @dataclass(frozen=True, slots=True)
@@ -95,12 +124,24 @@ def changed(loaded: LoadedMachine, edits: Sequence[FileEdit]) -> LoadedMachine:
         if any(origin == "environment" and _same(key, edit.key) for key, origin in loaded.origins.items()):
             raise ConfigError(f"{edit.key} comes from the environment of the service", "change it there")
         try:
-            text = edited(text, edit.key, json.loads(edit.value))
-        except ValueError as err:
+            text = edited(text, edit.key, _value(edit))
+            text.encode()
+        except (ValueError, RecursionError) as err:
             what = str(err) if isinstance(err, NotEditableError) else f"{edit.key} has no value that can be read"
             raise ConfigError(what, "nothing was changed") from None
     body = text.replace("\n", "\r\n") if b"\r\n" in loaded.body else text
     return parse_machine(loaded.path, body.encode())
+
+
+def _value(edit: FileEdit) -> Any:
+    """The wanted value; only where a last day belongs, the text of a day becomes a day. Raises ValueError or RecursionError."""
+    value = json.loads(edit.value)
+    if LOOSER.get(edit.key) != "later" or not isinstance(value, str):
+        return value
+    try:
+        return date.fromisoformat(value)
+    except ValueError:
+        raise ConfigError(f"{edit.key}: expected a day such as 2027-05-31, got {value!r}", "nothing was changed") from None
 
 
 def _same(key: str, other: str) -> bool:
@@ -108,34 +149,28 @@ def _same(key: str, other: str) -> bool:
 
 
 def differences(old: LoadedMachine, new: LoadedMachine) -> tuple[Change, ...]:
-    """The values in force that differ, in the order of the documentation; schedules are compared by their names."""
+    """The values in force that differ, in the order of the documentation; schedules are compared by their names. A section in which only
+    a secret differs is a change of the section, without values."""
     before, after = ({_by_name(one, key): value for key, value, _ in one.values()} for one in (old, new))
     keys = [key for key in dict.fromkeys([*before, *after]) if before.get(key) != after.get(key)]
-    return tuple(Change(key, before.get(key), after.get(key), is_looser(key, before.get(key), after.get(key))) for key in keys)
+    found = [Change(key, before.get(key), after.get(key), is_looser(key, before.get(key), after.get(key))) for key in keys]
+    told = {section_of(key) for key in keys}
+    first, then = (one.machine.model_dump(mode="json") for one in (old, new))
+    return (*found, *(Change(name, "", "", looser=False) for name in then if name not in told and first[name] != then[name]))
 
 
 def _by_name(loaded: LoadedMachine, key: str) -> str:
-    for number, entry in enumerate(loaded.machine.schedule, start=1):
-        key = key.replace(f"schedule[{number}].", f"schedule[{entry.name}].", 1)
-    return key
+    found = NUMBERED.match(key)
+    return key if found is None else f"schedule[{loaded.machine.schedule[int(found[1]) - 1].name}].{key[found.end() :]}"
 
 
 def is_looser(key: str, old: Any, new: Any) -> bool:
     """Whether a value allows more than another one did, by `LOOSER`; a key without a rule loosens nothing."""
-    match LOOSER.get(key):
-        case "more":
-            return bool(new > old)
-        case "less":
-            return bool(new < old)
-        case "added":
-            return not set(new) <= set(old)
-        case "wider" if old is not None:
-            return new is None or new[0] < old[0] or new[1] > old[1]
-        case "later":
-            return new is not None and (old is None or new > old)
-        case "stated":
-            return new is not None
-    return False
+    if section_of(key) == "schedule":
+        key = f"schedule.{key.rpartition('].')[2]}"
+        if new is None or (old is None and key != "schedule.name"):  # of a schedule that is removed, or that is new
+            return False
+    return key in LOOSER and bool(_IS_LOOSER[LOOSER[key]](old, new))
 
 
 def _shown(value: Any) -> str:

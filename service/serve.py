@@ -44,7 +44,7 @@ from abbe.service.scheduler.alarm_manager import AlarmChannels, AlarmManager
 from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.scheduler.job import CheckJobs
 from abbe.service.scheduler.loop import LoopTerms, Scheduler
-from abbe.service.scheduler.ports import JobWatcher
+from abbe.service.scheduler.ports import JobWatcher, Readiness
 from abbe.service.scheduler.retrying_store import StoreLedger, StoreShelf
 from abbe.service.sequences.recipes.campaigns import split_recipe_name
 from abbe.service.storage.engine import database_readable_by_others, parse_url
@@ -110,7 +110,8 @@ class Service:
                 lambda who: asyncio.to_thread(may, store, who, Permission.PROPOSE),
                 alarms,
             )
-        terms = LoopTerms(setup.maintenance, setup.ready(clock), follow_ups=alarms, run_job=self._jobs.run)
+        self.ready = setup.ready(clock)
+        terms = LoopTerms(setup.maintenance, self.ready, follow_ups=alarms, run_job=self._jobs.run)
         self._scheduler = Scheduler(setup.schedules, StoreLedger(store, clock, setup.machine), self._jobs, self._shelf, clock, terms)
         snapshots = SnapshotSource(self.board, self._jobs, self._scheduler.next_due, clock)
         orders = Orders(store, clock, self._jobs, context, OrderActions() if setup.actions is None else setup.actions(store))
@@ -138,6 +139,7 @@ class Service:
             lambda: self._jobs.claim,
             partial(push_is_open, store, setup.machine, setup.control),
             restart,
+            setup.devices.get("cnc"),
         )
 
     def _begin(self, recipes: tuple[str, ...]) -> Begin:
@@ -338,10 +340,21 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
             service, passed = await _live(setup, listening, clock, stop, open_push_readers, once=once)
             if service.following is None or stop.is_set():
                 return passed
-            setup = service.following
+            setup = _continued(service.following, service.ready)
             log.info("starting anew with the changed machine file")
     finally:
         listening.close()
+
+
+def _continued(setup: ServiceSetup, earlier: Readiness) -> ServiceSetup:
+    """A setup whose service knows when the machine was at work before: a machine does not cool down because its file has changed."""
+
+    def ready(clock: Clock) -> Readiness:
+        made = setup.ready(clock)
+        made.continue_from(earlier)
+        return made
+
+    return replace(setup, ready=ready)
 
 
 async def _live(

@@ -19,7 +19,6 @@ _NAME = r"""(?:[A-Za-z0-9_-]+|"(?:\\.|[^"\\\n])*"|'[^'\n]*')"""
 _LEFT = re.compile(rf"[ \t]*{_NAME}(?:[ \t]*\.[ \t]*{_NAME})*[ \t]*=")
 _PART = re.compile(r"([^.\[\]]+)(?:\[([1-9]\d*)\])?")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
-_DATE = re.compile(r"\d{4}-\d\d-\d\d")
 Path = tuple[str | int, ...]
 """Keys and, behind that of a list of tables, the number of the table, from 0."""
 
@@ -190,12 +189,12 @@ def _written(statement: str, value: Any) -> str:
 
 
 def toml(value: Any) -> str:
-    """A value of JSON as TOML on one line; a text that is a date becomes a date. Raises TypeError for what TOML cannot hold."""
+    """A value of JSON, or a date, as TOML on one line. Raises TypeError for what TOML cannot hold."""
     if isinstance(value, dict):
         return "{" + ", ".join(f"{_name(key)} = {toml(one)}" for key, one in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(toml(one) for one in value) + "]"
-    if isinstance(value, str) and not _DATE.fullmatch(value):
+    if isinstance(value, str):
         return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
     if value is None:
         raise TypeError("TOML has no empty value")

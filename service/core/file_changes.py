@@ -7,7 +7,7 @@ file is judged by what judges it at a start, `abbe serve`'s own setup.
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -18,29 +18,42 @@ from abbe.service.channel.messages import Answer, ChangeFile, Outcome
 from abbe.service.config import LoadedMachine, load_machine
 from abbe.service.core.jobs import MachineClaim
 from abbe.service.core.setup import MachineFileSource, ServiceSetup
+from abbe.service.devices.session import lock_machine
 from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.errors import AbbeError, ConfigError
+from abbe.service.errors import AbbeError, ConfigError, MachineInUse
 from abbe.service.files import replace_file
 from abbe.service.machine_changes import RIGHTS, Change, changed, differences, section_of
 from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.file")
 ACTION = "machine file"
-NEEDS_START = ("web", "store")
-"""Sections whose change needs a start of the service by its computer: this process keeps its address and its database."""
+FILE_ONLY = "limits.two_people"
+"""Nobody switches this off on the page: the one person who could is the one it keeps from deciding alone."""
 LONGEST_TARGET = 400
+CLOSED = "{key} is different in the file: only a start of the service by its computer takes it over"
 
 
 @dataclass(frozen=True, slots=True)
 class FileChangeContext:
     """What a change needs to know. ``may(who, need)``: rights; ``claim``: claim on the machine, None: no jobs now; ``push_open``: whether a
-    push is unfinished; ``restart``: starts the service anew with a setup."""
+    push is unfinished; ``restart``: starts the service anew with a setup; ``cnc``: URL of the controller, None: there is none."""
 
     may: Callable[[str, Permission], Awaitable[bool]]
     audit: AuditBook
     claim: Callable[[], MachineClaim | None]
     push_open: Callable[[], Awaitable[bool]]
     restart: Callable[[ServiceSetup], None]
+    cnc: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class _Plan:
+    """A change that is allowed: the file before and after, what differs, and the setup that it makes."""
+
+    old: LoadedMachine
+    new: LoadedMachine
+    found: tuple[Change, ...]
+    setup: ServiceSetup
 
 
 class _Refusal(Exception):  # noqa: N818 - an answer, not an error
@@ -58,38 +71,55 @@ class FileChanges:
         self._source, self._context = source, context
 
     async def change(self, asked: ChangeFile) -> Answer:
-        """Change the file; a person's answer says why not. After "done" the service starts anew."""
+        """Change the file; a person's answer says why not. After "done" the service starts anew.
+
+        What has begun is brought to its end even if nobody waits for the answer any more: a written file is always taken over.
+        """
+        self._work = asyncio.ensure_future(self._carried_out(asked))
+        return await asyncio.shield(self._work)
+
+    async def _carried_out(self, asked: ChangeFile) -> Answer:
         try:
-            await self._check_rights(asked)
+            await self._check_rights(asked.who, [edit.key for edit in asked.edits])
             claim = self._context.claim()
             if claim is None:
                 raise _Refusal("busy", "the service takes no jobs now: it is starting, ending, or running its timetable once")
             if other := claim.take(ACTION):
                 raise _Refusal("busy", f"the machine is in use: {other}")
             try:
-                if await self._context.push_open():
-                    raise _Refusal("conflict", "a push is not finished: the limits stay as they are until it is")
-                setup = await asyncio.to_thread(self._changed, asked)
+                setup = await self._claimed(asked)
             except BaseException:
                 claim.give_back()
                 raise
         except _Refusal as no:
             return _answer(asked, no.outcome, str(no))
+        except MachineInUse as error:
+            return _answer(asked, "busy", error.detail)
         except AbbeError as error:
             return _answer(asked, "conflict", error.detail.removeprefix(f"{self._source.loaded.path}: "))
         self._context.restart(setup)  # the claim stays taken: nothing begins with the old values
         return _answer(asked, "done", "")
 
-    async def _check_rights(self, asked: ChangeFile) -> None:
-        sections = {section_of(edit.key) for edit in asked.edits}
-        if closed := sorted(sections - set(RIGHTS)):
-            raise _Refusal("forbidden", f"[{closed[0]}] cannot be changed on the page")
-        for need in sorted({RIGHTS[one] for one in sections} or {Permission.CONFIGURE}):
-            if not await self._context.may(asked.who, need):
-                raise _Refusal("forbidden", f"{asked.who} may not {need} here")
+    async def _check_rights(self, who: str, keys: Iterable[str], closed: str = "[{section}] cannot be changed on the page") -> None:
+        """Refuse keys of sections that the page does not change, and of those that a person may not change."""
+        needed = {Permission.CONFIGURE} if not keys else set[Permission]()
+        for key in keys:
+            if (section := section_of(key)) not in RIGHTS:
+                raise _Refusal("forbidden", closed.format(key=key, section=section))
+            needed.add(RIGHTS[section])
+        for need in sorted(needed):
+            if not await self._context.may(who, need):
+                raise _Refusal("forbidden", f"{who} may not {need} here")
 
-    def _changed(self, asked: ChangeFile) -> ServiceSetup:
-        """Write the file with its record in the audit; return the setup that it makes."""
+    async def _claimed(self, asked: ChangeFile) -> ServiceSetup:
+        """Change the file while nobody else uses the machine; return the setup that the changed file makes."""
+        if await self._context.push_open():
+            raise _Refusal("conflict", "a push is not finished: the limits stay as they are until it is")
+        plan = await asyncio.to_thread(self._planned, asked)
+        await self._check_rights(asked.who, [one.key for one in plan.found], CLOSED)  # of a file edited by hand: of all that differs
+        return await asyncio.to_thread(self._written, asked, plan)
+
+    def _planned(self, asked: ChangeFile) -> _Plan:
         old = self._source.loaded
         now = load_machine(old.path)
         if asked.sha256 != old.sha256 or (asked.edits and now.body != old.body):
@@ -99,30 +129,34 @@ class FileChanges:
         new = changed(now, asked.edits)
         found = differences(old, new)
         _check(asked, old, new, found)
-        setup = self._source.prepare(new)
-        begun = _event(asked, old, new, found)
-        self._context.audit.write(begun)
-        if asked.edits:
-            try:
-                replace_file(old.path, new.body)
-            except OSError as err:
-                self._context.audit.write(replace(begun, outcome="failed"))
-                raise ConfigError(
-                    f"the service may not write {old.path}: {err.strerror}", "give it the right to write this folder"
-                ) from None
+        return _Plan(old, new, found, self._source.prepare(new))
+
+    def _written(self, asked: ChangeFile, plan: _Plan) -> ServiceSetup:
+        """Write the file with its record in the audit; a command that uses the machine meanwhile is refused, and refuses the change."""
+        begun = _event(asked, plan.old, plan.new, plan.found)
+        with lock_machine(self._context.cnc):
+            self._context.audit.write(begun)
+            if asked.edits:
+                try:
+                    replace_file(plan.old.path, plan.new.body)
+                except OSError as err:
+                    self._context.audit.write(replace(begun, outcome="failed"))
+                    raise ConfigError(
+                        f"the service may not write {plan.old.path}: {err.strerror}", "give it the right to write this folder"
+                    ) from None
         try:
             self._context.audit.write(replace(begun, outcome="done"))
         except AbbeError as error:  # the file is changed and the first record says so: the service must not go on with the old values
             log.error("audit record failed", cause=error.detail)
-        log.warning("machine file changed", who=asked.who, changes=[str(one) for one in found])
-        return setup
+        log.warning("machine file changed", who=asked.who, changes=[str(one) for one in plan.found])
+        return plan.setup
 
 
 def _check(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tuple[Change, ...]) -> None:
     if not found and (asked.edits or old.body == new.body):
         raise _Refusal("conflict", "nothing is different from the file in force")
-    if fixed := next((one.key for one in found if section_of(one.key) in NEEDS_START), ""):
-        raise _Refusal("conflict", f"{fixed} is different in the file: only a start of the service by its computer takes it over")
+    if any(one.key == FILE_ONLY and one.looser for one in found):
+        raise _Refusal("conflict", f"{FILE_ONLY} is switched off in the file only, by whoever may start the service")
     looser = [str(one) for one in found if one.looser]
     if looser and not (asked.looser and asked.reason.strip()):
         raise _Refusal("conflict", f"this allows more than before: {', '.join(looser)}. Tick that you mean it, and give the reason")

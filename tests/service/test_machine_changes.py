@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields as dataclass_fields
 from pathlib import Path
 
 import pytest
@@ -9,6 +10,7 @@ import pytest
 from abbe.service.config import LoadedMachine, parse_machine
 from abbe.service.config_schema import Calibration, Limits, Verify
 from abbe.service.domain.machine_file import FileEdit
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import ConfigError
 from abbe.service.machine_changes import LOOSER, RIGHTS, changed, differences, is_looser
 from abbe.service.users.roles import ALLOWED, Permission, Role
@@ -24,6 +26,10 @@ Z = [0, 450]
 table_value_um = 80.0  # of the maker
 [calibration]
 laser = 2027-01-31
+"""
+SCHEDULE = """[[schedule]]
+name = "{}"
+cron = "{}"
 """
 IDENTITIES = {f"calibration.{kind}_is" for kind in ("ballbar", "laser", "artefact")}
 
@@ -55,11 +61,26 @@ def test_a_change_is_parsed_as_the_file_is_and_told_with_both_values(loaded: Loa
         ("limits", "5"),
         ("schedule[3].name", '"late"'),
         ("schedule[1].name", '"without times"'),
+        ("calibration.laser", '"2027-02-30"'),
+        ("calibration.laser", '"2027-2-3"'),
+        ("item.serial", "[" * 3900),
+        ("item.serial", "[" * 400 + "]" * 400),
+        ("item.serial", '{"a":' * 900 + "1" + "}" * 900),
+        ("item.serial", '"\\ud83d"'),
+        ("calibration.laser", '"\\ud83d"'),
     ],
 )
 def test_what_the_parser_refuses_is_no_change(loaded: LoadedMachine, key: str, value: str) -> None:
     with pytest.raises(ConfigError):
         changed(loaded, (FileEdit(key, value),))
+
+
+def test_an_impossible_day_is_told_clearly_and_a_serial_number_that_looks_like_a_day_is_text(loaded: LoadedMachine) -> None:
+    with pytest.raises(ConfigError, match=r"^calibration\.laser: expected a day such as 2027-05-31, got '2027-02-30'"):
+        changed(loaded, (FileEdit("calibration.laser", '"2027-02-30"'),))
+    new = changed(loaded, (FileEdit("item.serial", '"2027-05-31"'),))
+    assert new.machine.item.serial == "2027-05-31"
+    assert new.body.decode().endswith('[item]\nserial = "2027-05-31"\n')
 
 
 def test_what_the_environment_sets_is_not_changed_in_the_file(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -82,6 +103,23 @@ def test_schedules_are_told_by_their_names(loaded: LoadedMachine) -> None:
     assert {str(change).partition(".")[0] for change in differences(two, one)} == {"schedule[a]"}
 
 
+def test_a_schedule_whose_name_is_a_number_hides_no_other() -> None:
+    one = parse_machine(PATH, f"{TEXT}{SCHEDULE.format('2', '0 6 * * 1')}{SCHEDULE.format('b', '0 7 * * 1')}".encode())
+    two = parse_machine(PATH, f"{TEXT}{SCHEDULE.format('2', '* * * * *')}{SCHEDULE.format('b', '0 7 * * 1')}".encode())
+    assert [str(change) for change in differences(one, two)] == ["schedule[2].cron 0 6 * * 1 → * * * * *"]
+
+
+def test_a_section_in_which_only_a_secret_differs_is_named_without_it() -> None:
+    one, two = (parse_machine(PATH, f'{TEXT}[mqtt]\nurl = "mqtt://u:{word}@broker:1883"\n'.encode()) for word in ("old", "new"))
+    assert [(change.key, str(change)) for change in differences(one, two)] == [("mqtt", "mqtt – → –")]
+
+
+def test_a_new_schedule_is_looser_by_its_name_and_a_removed_one_in_nothing(loaded: LoadedMachine) -> None:
+    new = parse_machine(PATH, f"{TEXT}{SCHEDULE.format('night', '0 2 * * *')}".encode())
+    assert [str(change) for change in differences(loaded, new) if change.looser] == ["schedule[night].name – → night"]
+    assert [change for change in differences(new, loaded) if change.looser] == []
+
+
 @pytest.mark.parametrize(
     ("key", "tight", "loose"),
     [
@@ -95,6 +133,13 @@ def test_schedules_are_told_by_their_names(loaded: LoadedMachine) -> None:
         ("calibration.laser", "2027-01-31", "2027-02-01"),
         ("calibration.laser", None, "2027-02-01"),
         ("calibration.room_temperature_c", None, [20.0, 21.0]),
+        ("schedule[a.b].needs.idle", True, False),
+        ("schedule[night].needs.warm_min", 30.0, 0.0),
+        ("schedule[night].needs.air", True, False),
+        ("schedule[night].needs.operator", "absent", "any"),
+        ("schedule[night].on_alarm", "none", "propose"),
+        ("schedule[night].catch_up", "skip", "once"),
+        ("schedule[night].grace_s", 300.0, 600.0),
     ],
 )
 def test_what_allows_more_is_looser_and_its_contrary_is_not(key: str, tight: object, loose: object) -> None:
@@ -104,10 +149,28 @@ def test_what_allows_more_is_looser_and_its_contrary_is_not(key: str, tight: obj
         assert not is_looser(key, loose, tight)
 
 
-def test_every_limit_and_every_certificate_has_a_rule() -> None:
-    """A new limit cannot be forgotten."""
+@pytest.mark.parametrize(
+    ("key", "one", "other"),
+    [
+        ("cron", "0 6 * * 1", "0 7 * * 1"),
+        ("timezone", "UTC", "Europe/Berlin"),
+        ("every_h", 24.0, 12.0),
+        ("first", "2026-01-01T00:00:00Z", "2026-01-01T01:00:00Z"),
+        ("recipe", "quick-check", "full-check"),
+    ],
+)
+def test_another_time_or_recipe_of_a_schedule_is_looser_both_ways(key: str, one: object, other: object) -> None:
+    assert is_looser(f"schedule[night].{key}", one, other)
+    assert is_looser(f"schedule[night].{key}", other, one)
+    assert not is_looser(f"schedule[night].{key}", one, one)
+
+
+def test_every_limit_certificate_and_value_of_a_schedule_has_a_rule() -> None:
+    """A new one cannot be forgotten."""
     sections = {"limits": Limits, "verify": Verify, "calibration": Calibration}
     keys = {f"{name}.{key}" for name, model in sections.items() for key in model.model_fields}
+    keys |= {f"schedule.{one.name}" for one in dataclass_fields(Schedule) if one.name != "needs"}
+    keys |= {f"schedule.needs.{one.name}" for one in dataclass_fields(Needs)}
     assert set(LOOSER) == keys - IDENTITIES
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tomllib
+from datetime import date
 from pathlib import Path
 
 import pytest
@@ -59,7 +60,8 @@ def lines_changed(text: str, key: str, value: object) -> tuple[list[str], list[s
         ),
         ("name", 'a "b"', ['name = "mill # 7"   # a name'], ['name = "a \\"b\\""  # a name']),
         ("vertical_axis", "Z", [], ['vertical_axis = "Z"']),
-        ("calibration.ballbar", "2027-05-31", [], ["[calibration]", "ballbar = 2027-05-31"]),
+        ("calibration.ballbar", date(2027, 5, 31), [], ["[calibration]", "ballbar = 2027-05-31"]),
+        ("item.serial", "2027-05-31", [], ["[item]", 'serial = "2027-05-31"']),
         ("schedule[1].needs.warm_min", 5, ["needs = { idle = true, warm_min = 20.0 }"], ["needs = {idle = true, warm_min = 5}"]),
         ("schedule[2].needs.warm_min", 5, [], ["warm_min = 5"]),
         ("schedule[2].cron", "0 1 * * *", [], ['cron = "0 1 * * *"']),
@@ -89,8 +91,7 @@ def test_every_value_of_the_example_can_be_written_and_stays_the_same() -> None:
         value: object = values
         for part in key.replace("[", ".[").split("."):
             value = value[int(part[1:-1]) - 1] if part.startswith("[") else value[part]  # type: ignore[index]
-        plain = str(value) if not isinstance(value, bool | int | float | list | str) else value
-        assert tomllib.loads(edited(EXAMPLE, key, plain)) == values
+        assert tomllib.loads(edited(EXAMPLE, key, value)) == values
 
 
 @pytest.mark.parametrize(

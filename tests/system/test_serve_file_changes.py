@@ -98,7 +98,9 @@ def test_a_change_is_in_the_file_in_the_service_in_the_commands_and_in_the_audit
     assert (COMMENT in desk.file.read_text(), "helix_rms_um = 6.5  # of the maker" in desk.file.read_text()) == (True, True)
     desk.changed("certificates", "approver", **{"calibration.ballbar": "2031-05-31"}, looser="yes", reason="certificate K-88")
     name = {f"schedule[1].{key}": value for key, value in {"name": "week", "cron": "0 6 * * 1", "timezone": "UTC"}.items()}
-    desk.changed("schedule", "admin", **name)
+    refused = desk.post("schedule", "admin", **name)
+    assert (refused.status_code, "allows more than before" in refused.json()["detail"]) == (409, True)
+    desk.changed("schedule", "admin", **name, looser="yes", reason="agreed with the shift")
     due = desk.running.http.get("/api/v1/status", headers=desk.running.who["viewer"]).json()["next_due"]
     assert [one["schedule"] for one in due] == ["week"]
     desk.changed("schedule", "admin", **{"schedule[1].name": "week", "remove": "yes"})

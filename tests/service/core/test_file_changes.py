@@ -5,6 +5,8 @@ from __future__ import annotations
 import asyncio
 import os
 import stat
+import threading
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -15,8 +17,9 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, ChangeFile
 from abbe.service.config import load_machine
 from abbe.service.core import file_changes
-from abbe.service.core.file_changes import FileChangeContext, FileChanges
+from abbe.service.core.file_changes import CLOSED, FileChangeContext, FileChanges
 from abbe.service.core.setup import MachineFileSource
+from abbe.service.devices.session import lock_machine
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.machine_file import FileEdit
 from abbe.service.errors import ConfigError, StoreError
@@ -26,6 +29,7 @@ from tests.service.test_machine_changes import TEXT
 
 VALUE = FileEdit("limits.table_value_um", "70")
 LOOSER = FileEdit("limits.table_value_um", "90")
+NIGHT = (FileEdit("schedule[1].name", '"night"'), FileEdit("schedule[1].cron", '"* * * * *"'))
 
 
 @dataclass
@@ -51,6 +55,7 @@ class Bench:
     claim: Claimed = field(default_factory=Claimed)
     takes_jobs: bool = True
     pushing: bool = False
+    cnc: str | None = None
     bad: str = ""
     begun: list[Any] = field(default_factory=list)
 
@@ -70,7 +75,9 @@ class Bench:
                 raise ConfigError(self.bad)
             return loaded
 
-        context = FileChangeContext(may, self.audit, lambda: self.claim if self.takes_jobs else None, push_open, self.begun.append)
+        context = FileChangeContext(
+            may, self.audit, lambda: self.claim if self.takes_jobs else None, push_open, self.begun.append, self.cnc
+        )
         asked = ChangeFile(request=5, who=who, sha256=sha256 or self.loaded.sha256, edits=edits, reason=reason, looser=looser)
         answer = await FileChanges(MachineFileSource(self.loaded, prepare), context).change(asked)
         assert answer.request == 5
@@ -114,6 +121,9 @@ async def test_a_change_is_recorded_then_written_then_the_service_starts_anew(be
         ((LOOSER,), "user:both", "conflict", "this allows more than before: limits.table_value_um 80.0 → 90.0"),
         ((FileEdit("limits.table_value_um", "80"),), "user:both", "conflict", "nothing is different"),
         ((FileEdit("limits.table_value_um", "-3"),), "user:both", "conflict", "limits.table_value_um: expected"),
+        ((FileEdit("item.serial", "[" * 3900),), "user:both", "conflict", "item.serial has no value that can be read"),
+        ((FileEdit("item.serial", '"\\ud83d"'),), "user:both", "conflict", "item.serial has no value that can be read"),
+        (NIGHT, "user:adam", "conflict", "this allows more than before: schedule[night].name – → night. Tick"),
     ],
 )
 async def test_what_may_not_be_is_refused(bench: Bench, edits: tuple[FileEdit, ...], who: str, outcome: str, text: str) -> None:
@@ -161,10 +171,99 @@ async def test_an_editor_is_not_overwritten_and_his_work_is_taken_over(bench: Be
     assert bench.recorded()[-1] == ("user:both", "item.serial – → 7", "done")
 
 
-async def test_an_address_taken_over_by_hand_needs_a_start_by_the_computer(bench: Bench) -> None:
-    bench.file.write_text(TEXT + "[web]\nport = 9000\n")
-    assert "web.port" in (await bench.ask()).text
+@pytest.mark.parametrize(
+    ("before", "after", "key"),
+    [
+        ("X = [0, 600]", "X = [0, 900]", "stroke_mm.X"),
+        ("[limits]", "[web]\nport = 9000\n[limits]", "web.port"),
+        ("[limits]", '[alarm]\npush = "approved"\n[limits]', "alarm.push"),
+        ("[limits]", '[mqtt]\nurl = "mqtt://u:p@broker:1883"\n[limits]', "mqtt.url"),
+        ('name = "mill"', 'name = "lathe"', "name"),
+    ],
+)
+async def test_only_a_start_takes_over_by_hand_what_the_page_does_not_change(bench: Bench, before: str, after: str, key: str) -> None:
+    mine = TEXT.replace(before, after)
+    bench.file.write_text(mine)
+    answer = await bench.ask(looser=True, reason="because")
+    assert (answer.outcome, answer.text) == ("forbidden", CLOSED.format(key=key))
+    assert (bench.file.read_text(), bench.begun, bench.claim.name, bench.recorded()) == (mine, [], "", [])
+
+
+async def test_a_limit_changed_by_hand_needs_the_right_for_limits(bench: Bench) -> None:
+    bench.file.write_text(TEXT.replace("80.0", "900"))
+    answer = await bench.ask(who="user:adam", looser=True, reason="because")
+    assert (answer.outcome, answer.text, bench.begun) == ("forbidden", "user:adam may not approve here", [])
+    bench.file.write_text(TEXT + '[item]\nserial = "7"\n')
+    assert (await bench.ask(who="user:adam")).outcome == "done"
+
+
+async def test_a_second_person_is_kept_on_the_page_and_asked_for_on_it(bench: Bench) -> None:
+    bench.file.write_text(TEXT.replace("[limits]", "[limits]\ntwo_people = true"))
+    bench.loaded = load_machine(bench.file)
+    for value in ("false", "null"):
+        answer = await bench.ask(FileEdit("limits.two_people", value), looser=True, reason="she is on holiday")
+        assert (answer.outcome, "switched off in the file only" in answer.text) == ("conflict", True)
     assert bench.begun == []
+    bench.file.write_text(TEXT)
+    bench.loaded = load_machine(bench.file)
+    assert (await bench.ask(FileEdit("limits.two_people", "true"))).outcome == "done"
+
+
+async def test_nothing_is_changed_while_a_command_measures(bench: Bench) -> None:
+    bench.cnc = "tcp://127.0.0.1:5020"
+    with lock_machine(bench.cnc):
+        answer = await bench.ask(VALUE)
+    assert (answer.outcome, "is in use by process" in answer.text) == ("busy", True)
+    untouched(bench)
+    assert (await bench.ask(VALUE)).outcome == "done"
+
+
+@pytest.mark.parametrize("fails", [False, True])
+async def test_a_change_that_nobody_waits_for_any_more_is_brought_to_its_end(
+    bench: Bench, monkeypatch: pytest.MonkeyPatch, *, fails: bool
+) -> None:
+    """The process of the page dies while the file is being written: the service has the changed file, or all is as before."""
+    begun, go_on, real = threading.Event(), threading.Event(), file_changes.replace_file
+
+    def slow(path: Path, body: bytes) -> None:
+        begun.set()
+        assert go_on.wait(60)
+        if fails:
+            raise OSError(28, os.strerror(28))
+        real(path, body)
+
+    monkeypatch.setattr(file_changes, "replace_file", slow)
+    asked = asyncio.create_task(bench.ask(VALUE))
+    assert await asyncio.to_thread(begun.wait, 60)
+    asked.cancel()
+    with suppress(asyncio.CancelledError):
+        await asked
+    held, rest = bench.claim.name, asyncio.all_tasks() - {asyncio.current_task()}
+    go_on.set()
+    assert held, "the thread still writes"
+    await asyncio.wait(rest, timeout=60)
+    assert (len(bench.begun), bool(bench.claim.name), bench.file.read_text() != TEXT) == (not fails, not fails, not fails)
+
+
+async def test_a_folder_that_cannot_be_flushed_is_no_failed_change(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
+    real = os.fsync
+
+    def no_folders(descriptor: int) -> None:
+        if stat.S_ISDIR(os.fstat(descriptor).st_mode):
+            raise OSError(22, os.strerror(22))
+        real(descriptor)
+
+    monkeypatch.setattr(os, "fsync", no_folders)
+    assert (await bench.ask(VALUE)).outcome == "done"
+    assert (len(bench.begun), bench.recorded()[-1][2]) == (1, "done")
+
+
+async def test_a_link_laid_where_the_new_file_is_written_leads_nowhere(bench: Bench) -> None:
+    other = bench.file.with_name("other")
+    other.write_text("kept")
+    bench.file.with_name(".machine.toml.new").symlink_to(other)
+    assert (await bench.ask(VALUE)).outcome == "done"
+    assert (other.read_text(), bench.file.is_symlink()) == ("kept", False)
 
 
 async def test_without_the_audit_nothing_is_written(bench: Bench, monkeypatch: pytest.MonkeyPatch) -> None:
