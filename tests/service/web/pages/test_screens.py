@@ -17,6 +17,8 @@ from abbe.service.web.login.access import route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from tests.pages_world import PHRASE, PROPOSER, USERS, Filled, Served, as_user, screens
 
+PART = re.compile(r'<(?:script|link rel="stylesheet")[^>]* (?:src|href)="([^"]+)"')
+HEAVIEST = 150_000
 SVG = re.compile(r"<svg.*?</svg>", re.DOTALL)
 SIGNED = {"clear": "yes", "password": PHRASE}
 
@@ -31,12 +33,27 @@ def addresses(running: Served) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def pages(running: Served) -> dict[str, str]:
+def answers(running: Served) -> dict[str, httpx.Response]:
     """Every screen as an approver gets it, who sees more of it than anybody else."""
     with as_user(running, "anna") as client:
-        answers = {path: client.get(path) for path in addresses(running)}
-    assert {path: one.status_code for path, one in answers.items() if one.status_code != 200} == {}
+        found = {path: client.get(path) for path in addresses(running)}
+    assert {path: one.status_code for path, one in found.items() if one.status_code != 200} == {}
+    return found
+
+
+@pytest.fixture(scope="module")
+def pages(answers: dict[str, httpx.Response]) -> dict[str, str]:
     return {path: one.text for path, one in answers.items()}
+
+
+def test_every_screen_is_light_with_its_scripts_and_styles(running: Served, answers: dict[str, httpx.Response]) -> None:
+    """As they come over the wire. A store of a year is weighed in a browser by `tests/system/test_weights.py`, in the long run."""
+    parts = {path: set(PART.findall(one.text)) for path, one in answers.items()}
+    with as_user(running, "anna") as client:
+        own = {path: client.get(path).num_bytes_downloaded for path in set().union(*parts.values())}
+    found = {path: one.num_bytes_downloaded + sum(own[part] for part in parts[path]) for path, one in answers.items()}
+    assert min(own.values()) > 0
+    assert {path: size for path, size in found.items() if not 1_000 < size <= HEAVIEST} == {}
 
 
 @pytest.mark.parametrize("name", USERS)
