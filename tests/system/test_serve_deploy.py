@@ -46,6 +46,17 @@ def test_the_unit_is_locked_down(unit: Path) -> None:
     assert done.returncode == 0, done.stdout[-300:]
 
 
+def test_the_service_may_write_nothing_beside_the_passwords() -> None:
+    """Page and core are one account: what the unit lets it write, an intruder in the page can write. PID 1 reads `secrets.env` as root."""
+    unit, folders = ((DEPLOY / name).read_text() for name in ("abbe.service", "abbe-tmpfiles.conf"))
+    assert re.findall(r"(?m)^ReadWritePaths=(.*)$", unit) == ["/run/abbe"]
+    assert [line for line in folders.splitlines() if line and not line.startswith(("#", "d /run/"))] == []
+    (allowed,) = re.findall(r"(?m)^# ReadWritePaths=(.*)$", unit)
+    assert re.findall(r"(?m)^# d (\S+) ", folders) == [allowed]
+    (secrets,) = re.findall(r"(?m)^EnvironmentFile=-(.*)$", unit)
+    assert not Path(secrets).is_relative_to(allowed)
+
+
 def test_the_page_s_memory_leaves_the_core_half_of_the_unit_s() -> None:
     """And a page that the kernel ends does not end the service."""
     text = (DEPLOY / "abbe.service").read_text()
