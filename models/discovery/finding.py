@@ -20,7 +20,7 @@ from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexp
 from abbe.models.discovery.left_out import left_out_gap
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
-from abbe.models.discovery.residues import companions, leaning, residues, shared
+from abbe.models.discovery.residues import companions, leaning, residues, shared, ties
 from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
 from abbe.models.discovery.sensors import exchanged_sensor
 from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
@@ -172,7 +172,7 @@ def finding(
         verdict=verdict,
         effects=judgement.effects if is_named else (),
         location=location,
-        next_test=_next_test(problem, judgement.mean, solved, rivals) if is_named else propose_unnamed(case, unnamed),
+        next_test=_next_test(problem, judgement, solved, rivals) if is_named else propose_unnamed(case, unnamed),
         gaps=scattered(gaps) if is_named and judgement.mean and len(judgement.effects) > len(judgement.mean) else gaps,
         residual_before_mm=residuals[0],
         residual_after_mm=residuals[1],
@@ -222,13 +222,10 @@ def _judge(
     mean = {i: replace(_named(problem, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
     scatter = [_of_scatter(f) for f in loud if not is_unnamed(f.name)]
     names = [*mean.values(), *scatter]
-    small = {e.label: e.evidence for e in names if e.evidence < REST_SHARE * rest}
-    left = {
-        label: f"evidence {own:.0f}, but {rest:.0f} is left without explanation: possibly only a part of that"
-        for label, own in small.items()
-    }
-    left = {**residues(names, frozenset(e.label for e in scatter), shared(problem, found)), **left}
+    loudly, without = frozenset(e.label for e in scatter), shared(problem, found)
+    left = {**residues(names, loudly, without), **_parts(names, rest)}
     left |= leaning(problem, found, {*left, *(found[i].pick.label for i in companion)})
+    mean = _with_ties(mean, ties([e for e in names if e.label not in left], loudly, without))
     effects = sorted((e for e in (*mean.values(), *scatter) if e.label not in left), key=lambda e: (-e.evidence, e.label))
     wander = wandering(problem)
     least = REST_SHARE * max((w.evidence for w in wander), default=0.0)  # noise that wanders has waves and moments by chance
@@ -245,6 +242,28 @@ def _judge(
         rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
     return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
+
+
+def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
+    """Give the reason, by label, against effects that may be a part of what all findings leave without explanation (`REST_SHARE`)."""
+    return {
+        e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} is left without explanation: possibly only a part of that"
+        for e in effects
+        if e.evidence < REST_SHARE * rest
+    }
+
+
+def _with_ties(mean: Mapping[int, NamedEffect], pairs: frozenset[tuple[str, str]]) -> dict[int, NamedEffect]:
+    """Add to each effect the named effects that the readings cannot tell from it (`ties`) as alternatives.
+
+    The evidence that is missing if only the other effect is in the fit, in place of only this one, is the difference of their evidences.
+    """
+
+    def with_ties(e: NamedEffect) -> NamedEffect:
+        near = [(other.label, e.evidence - other.evidence) for other in mean.values() if (e.label, other.label) in pairs]
+        return replace(e, alternatives=tuple(sorted((*near, *e.alternatives), key=lambda rival: rival[1]))) if near else e
+
+    return {i: with_ties(e) for i, e in mean.items()}
 
 
 def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[frozenset[str], tuple[Structure, ...]]:
@@ -299,8 +318,13 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int])
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Return the labels of rivals that lack less than `EXCLUDED` of chi-square; `NamedEffect.alternatives` also contains weaker rivals."""
-    return tuple(dict.fromkeys(label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0))
+    """Return the labels of rivals that lack less than `EXCLUDED` of chi-square, and of named effects that are rivals (`ties`).
+
+    `NamedEffect.alternatives` also contains weaker rivals.
+    """
+    named = {e.label for e in effects}
+    near = (label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0 or label in named)
+    return tuple(dict.fromkeys(near))
 
 
 def _verdict(named: float, unnamed: float) -> Verdict:
@@ -342,19 +366,22 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
     return NamedEffect(f.name, f.key, f.strength, u, shape, c, np.array([[u * u]]), f.evidence, location=f.location)
 
 
-def _next_test(problem: WhitenedProblem, kept: Sequence[int], solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
+def _next_test(problem: WhitenedProblem, judged: _Judgement, solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
     """Propose the measurement that best separates the strongest named effect with rivals from them; without rivals, a holdout run."""
-    for i in kept:
-        if not rivals[i]:
-            continue
+    effects = {e.label: e for e in judged.effects}
+    for i in judged.mean:
         pick = solved.picks[i]
+        suspects = {p.label: p for p in (*solved.picks, *(r.pick for r in rivals[i]))}
+        near = [suspects[label] for label, _ in effects[pick.label].alternatives[:3]]
+        if not near:
+            continue
         plain = as_plain(problem, pick) @ solved.coefficients[i]
         leader = SuspectEffect(pick.effect, pick.key, pick.values, plain)
-        others = tuple(SuspectEffect(r.pick.effect, r.pick.key, r.pick.values) for r in rivals[i][:3])
+        others = tuple(SuspectEffect(p.effect, p.key, p.values) for p in near)
         test = propose(problem.case, leader, others, {k: c.sd_mm for k, c in problem.colours.items()})
         if test is not None:
             return test
-    return judging_run(problem.case) if kept else None
+    return judging_run(problem.case) if judged.mean else None
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:

@@ -321,17 +321,29 @@ def merged(contest: Contest, picks: list[Pick]) -> list[Pick]:
         rest = [p for k, p in enumerate(picks) if k not in (i, j)]
         rows = rows_for(problem, rest)
         both = gain_of(problem, a, rows) + gain_of(problem, b, rows_for(problem, [*rest, a]))
-        tried = []
-        for f in contest.shortlist(rows, [p.label for p in rest], TRIED):
-            if not f.pick.unnamed and not f.pick.effect.beside and f.gain > LIKE * both:
-                one, gain = refined(problem, f.pick, rows)
-                one, _, _ = _formed(contest, one, rows, gain)
-                one, gain = refined(problem, one, rows, sweeps=1)  # the forms move the best pitch or time constant
-                tried.append((gain - contest.price(one), one))
+        worth = both - contest.price(a) - contest.price(b)
+        near = [f for f in contest.shortlist(rows, [p.label for p in rest], TRIED) if f.gain > LIKE * both]
+        tried = [_formed_twice(contest, f.pick, rows, worth) for f in near if not f.pick.unnamed and not f.pick.effect.beside]
         best = max(tried, key=lambda t: t[0], default=None)
-        if best is not None and best[0] > both - contest.price(a) - contest.price(b):
+        if best is not None and best[0] > worth:
             return merged(contest, [*rest, best[1]])
     return picks
+
+
+def _formed_twice(contest: Contest, pick: Pick, rows: F2, worth: float) -> tuple[float, Pick]:
+    """Refine a pick, add its forms, and refine it again, because the forms move the best pitch or time constant; return score and pick.
+
+    A pick without non-linear parameters stays without forms if not even all forms together make its score larger than ``worth``.
+    """
+    one, gain = refined(contest.problem, pick, rows)
+    score = gain - contest.price(one)
+    if not one.effect.shape and gain_of(contest.problem, replace(one, forms=one.effect.forms), rows) - gain + score <= worth:
+        return score, one
+    one, gain, score = _formed(contest, one, rows, gain)
+    if one.forms and one.effect.shape:
+        one, gain = refined(contest.problem, one, rows, sweeps=1)
+        score = gain - contest.price(one)
+    return score, one
 
 
 def dropped(contest: Contest, picks: list[Pick]) -> list[Pick]:

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.answer import NamedEffect
-from abbe.models.discovery.finding import _confounded, _of_scatter
+from abbe.models.discovery.finding import _confounded, _of_scatter, _with_ties
 from abbe.models.discovery.localization import Localization
-from abbe.models.discovery.residues import residues
+from abbe.models.discovery.residues import residues, ties
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
@@ -74,12 +74,40 @@ def test_a_residue_is_weak_and_of_the_same_form(strong: str, weak: str, share: f
 
 
 def test_what_two_related_names_share_belongs_to_the_stronger_one() -> None:
-    pair = [effect("air_refraction", 70.0), effect("laser_cosine", 3.0)]
+    """Evidences of a case in which only air refraction is true."""
+    pair = [effect("air_refraction", 68.9), effect("laser_cosine", 2.9)]
     assert residues(pair, SCATTER) == {}
-    told = residues(pair, SCATTER, {("air_refraction", "laser_cosine"): 200.0, ("laser_cosine", "air_refraction"): 140.0})
+    without = {("air_refraction", "laser_cosine"): 202.8, ("laser_cosine", "air_refraction"): 136.7}
+    told = residues(pair, SCATTER, without)
+    assert ties(pair, SCATTER, without) == frozenset()
     assert told == {
-        "laser_cosine": "evidence 3, only 1.5% of that of air_refraction: possibly only the deviation of air_refraction from its formula"
+        "laser_cosine": "evidence 3, only 1.4% of that of air_refraction: possibly only the deviation of air_refraction from its formula"
     }
+
+
+def test_a_near_tie_of_two_related_names_rejects_neither_and_is_told() -> None:
+    air, cosine = pair = [effect("air_refraction", 70.0), effect("laser_cosine", 68.0)]
+    without = {("air_refraction", "laser_cosine"): 20_070.0, ("laser_cosine", "air_refraction"): 20_068.0}
+    assert residues(pair, SCATTER, without) == residues(pair[::-1], SCATTER, without) == {}
+    pairs = ties(pair, SCATTER, without)
+    assert pairs == {(air.label, cosine.label), (cosine.label, air.label)}
+    named = _with_ties({0: air, 3: cosine}, pairs)
+    assert (named[0].alternatives, named[3].alternatives) == ((("laser_cosine", 2.0),), (("air_refraction", -2.0),))
+    assert set(_confounded(list(named.values()))) == {"air_refraction", "laser_cosine"}
+    assert answered(named[0])["alternatives"] == ["laser_cosine"]
+
+
+@pytest.mark.parametrize(("weak", "residue", "tied"), [(34.0, True, False), (36.0, False, True), (70.0, False, True)])
+def test_shared_evidence_rejects_only_a_name_with_at_most_half_of_the_others_own(weak: float, residue: bool, tied: bool) -> None:
+    pair = [effect("air_refraction", 70.0), effect("laser_cosine", weak)]
+    without = {("air_refraction", "laser_cosine"): 20_070.0, ("laser_cosine", "air_refraction"): 20_000.0 + weak}
+    assert bool(residues(pair, SCATTER, without)) is residue
+    assert bool(ties(pair, SCATTER, without)) is tied
+
+
+def test_a_rival_with_weak_shared_evidence_is_no_tie() -> None:
+    pair = [effect("air_refraction", 70.0), effect("laser_cosine", 68.0)]
+    assert ties(pair, SCATTER, {("air_refraction", "laser_cosine"): 75.0, ("laser_cosine", "air_refraction"): 73.0}) == frozenset()
 
 
 def test_the_strongest_name_is_never_a_residue() -> None:

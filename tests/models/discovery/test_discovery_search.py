@@ -12,7 +12,7 @@ import pytest
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import rows_for
+from abbe.models.discovery.candidate_bank import gain_of, rows_for
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.instrument_noise import Colour, unscaled
@@ -181,6 +181,23 @@ def test_a_name_that_explains_nothing_without_a_residue_goes_with_the_residue() 
     assert set(told) == {"servo_mismatch:Z"}
     assert "servo_mismatch:X" in told["servo_mismatch:Z"]
     assert leaning(problem, [true, spoilt, repair], set()) == {}
+
+
+def test_a_lone_name_that_leans_on_one_residue_is_told_with_that_residue() -> None:
+    case = campaign(late_ms=0.2)
+    problem = whiten(case, baseline_of(case))
+    contest = Contest.of(problem, CATALOGUE)
+    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    lead, other, idle = by["servo_mismatch:X"], by["servo_mismatch:Z"], by["backlash:X"]
+    alone, beside = gain_of(problem, lead, rows_for(problem, [])), gain_of(problem, lead, rows_for(problem, [other]))
+    assert beside > 1.2 * alone > 0.0
+    cost = 0.5 * (alone + beside)
+    leans = Selection(lead, gain=beside, score=beside - cost)
+    found = [leans, Selection(other, 500.0, 450.0), Selection(idle, 60.0, 10.0)]
+    told = leaning(problem, found, {other.label, idle.label, "vibration:X"})
+    assert told == {lead.label: f"evidence {leans.score / 2.0:.0f}, but none without {other.label}, not named either"}
+    assert leaning(problem, found, {idle.label}) == {}
+    assert leaning(problem, [leans], {"vibration:X"}) == {}  # a variance effect is in no fit
 
 
 def test_what_two_names_explain_together_counts_for_each_with_the_other_taken_out() -> None:
