@@ -93,7 +93,7 @@ NUMBERED = re.compile(r"schedule\[([1-9]\d*)\]\.")
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class ValueChange:
     """A value in force before and after, as JSON has it. ``looser``: the new one allows more."""
 
     key: str
@@ -148,15 +148,15 @@ def _same(key: str, other: str) -> bool:
     return key == other or key.startswith((f"{other}.", f"{other}["))
 
 
-def differences(old: LoadedMachine, new: LoadedMachine) -> tuple[Change, ...]:
+def differences(old: LoadedMachine, new: LoadedMachine) -> tuple[ValueChange, ...]:
     """The values in force that differ, in the order of the documentation; schedules are compared by their names. A section in which only
     a secret differs is a change of the section, without values."""
     before, after = ({_by_name(one, key): value for key, value, _ in one.values()} for one in (old, new))
     keys = [key for key in dict.fromkeys([*before, *after]) if before.get(key) != after.get(key)]
-    found = [Change(key, before.get(key), after.get(key), is_looser(key, before.get(key), after.get(key))) for key in keys]
+    found = [ValueChange(key, before.get(key), after.get(key), is_looser(key, before.get(key), after.get(key))) for key in keys]
     told = {section_of(key) for key in keys}
     first, then = (one.machine.model_dump(mode="json") for one in (old, new))
-    return (*found, *(Change(name, "", "", looser=False) for name in then if name not in told and first[name] != then[name]))
+    return (*found, *(ValueChange(name, "", "", looser=False) for name in then if name not in told and first[name] != then[name]))
 
 
 def _by_name(loaded: LoadedMachine, key: str) -> str:

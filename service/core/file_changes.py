@@ -22,7 +22,7 @@ from abbe.service.devices.session import lock_machine
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.errors import AbbeError, ConfigError, MachineInUse
 from abbe.service.files import replace_file
-from abbe.service.machine_changes import RIGHTS, Change, changed, differences, section_of
+from abbe.service.machine_changes import RIGHTS, ValueChange, changed, differences, section_of
 from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.file")
@@ -52,7 +52,7 @@ class _Plan:
 
     old: LoadedMachine
     new: LoadedMachine
-    found: tuple[Change, ...]
+    found: tuple[ValueChange, ...]
     setup: ServiceSetup
 
 
@@ -152,7 +152,7 @@ class FileChanges:
         return plan.setup
 
 
-def _check(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tuple[Change, ...]) -> None:
+def _check(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tuple[ValueChange, ...]) -> None:
     if not found and (asked.edits or old.body == new.body):
         raise _Refusal("conflict", "nothing is different from the file in force")
     if any(one.key == FILE_ONLY and one.looser for one in found):
@@ -162,7 +162,7 @@ def _check(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tup
         raise _Refusal("conflict", f"this allows more than before: {', '.join(looser)}. Tick that you mean it, and give the reason")
 
 
-def _event(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tuple[Change, ...]) -> AuditEvent:
+def _event(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tuple[ValueChange, ...]) -> AuditEvent:
     target = ", ".join(str(one) for one in found) or Path(old.path).name
     doc = {
         "reason": asked.reason,
