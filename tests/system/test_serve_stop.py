@@ -23,7 +23,8 @@ def slots_of(folder: Path) -> set[str]:
 
     engine = create_engine(f"sqlite:///{folder / 'abbe.sqlite3'}")
     with engine.connect() as connection:
-        states = {str(row[0]) for row in connection.execute(text("SELECT state FROM slots"))}
+        # One row is no slot: it keeps since when each time rule is in force.
+        states = {str(row[0]) for row in connection.execute(text("SELECT state FROM slots WHERE state <> 'timetable'"))}
     engine.dispose()
     return states
 
