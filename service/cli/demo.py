@@ -176,6 +176,6 @@ def print_result(out: Console, result: DemoResult) -> None:
     out.print(table)
     best, share = result.truths[0].best_nine_tables_rms_um, 100 * table_factor(result).share
     out.print(DIAGONALS_TOLD)
-    out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; these tables reached {share:.0f} % of that improvement")
+    out.print(f"nine perfect one-axis tables would leave {best:.1f} µm rms; {share:.0f} % of their improvement factor was reached")
     decision = result.corrected.decision
     out.print(("kept: " if decision.keep else "rolled back: ") + decision.text)

@@ -131,9 +131,8 @@ async def _measured(
                     session, store, site, plan, progress=context.progress, clock=context.clock, campaign=begun, options=options
                 )
             except BaseException as error:
-                on_page = (
-                    "; the screen of a new measurement resumes it" if source.text is None else ""
-                )  # recipe files are not offered there
+                # The screen does not offer recipe files.
+                on_page = "; the screen of a new measurement resumes it" if source.text is None else ""
                 kept = f"completed runs of campaign {name!r} are kept{on_page}"
                 typed = f"`abbe measure -m MACHINE.toml --resume {name!r}` resumes, then `abbe comp propose -m MACHINE.toml {name!r}`"
                 error.add_note(f"{kept}; {typed}")
