@@ -15,7 +15,7 @@ from abbe.service.discovery.discover import discover as run_discovery
 from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.effect_pages import unit
 from abbe.service.domain.finding import Finding
-from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue, checked
 from abbe.service.rendering.document_page import write_document
 from abbe.service.report.report_discovery import found_report
@@ -64,7 +64,7 @@ class DiscoveryAnswer:
         return f"<abbe.Answer: {self.verdict}, {', '.join(self.effects) or 'no effect'}>"
 
 
-def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink | None = None) -> DiscoveryAnswer:
+def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink = ignore_progress) -> DiscoveryAnswer:
     """Find where measurement and simulation disagree, and name the missing effect.
 
     Parameters
@@ -72,7 +72,7 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     effects : tuple of Effect
         Additional effects to search for beside the catalogue; each must pass the self-test.
     progress : callable, optional
-        Receives `abbe.service.domain.progress.Progress` objects: ``done`` is the share of the work from 0 to 1, ``message`` a line of text.
+        Receives `abbe.service.domain.progress.Progress` objects, each a line of text as `str`; e.g. ``print``.
 
     Raises
     ------
@@ -84,12 +84,8 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     known = catalogue()
     job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))
     journal = DiscoveryJournal()
-    finding = run_discovery(job, journal, search, progress or _silent)
+    finding = run_discovery(job, journal, search, progress)
     found = {e.label: Estimate(e.strength, e.u_strength, unit(e.unit), "observed") for e in finding.effects}
     gap = {role: asdict(one) for role, one in finding.gaps.items()}
     following = None if finding.next_test is None else asdict(finding.next_test)
     return DiscoveryAnswer(finding.verdict, finding.proved, found, gap, following, job, journal, finding)
-
-
-def _silent(_: Progress) -> None:
-    return None

@@ -94,7 +94,7 @@ def plan(
     instruments : str or Path, optional
         File of the bars, noise and set-up times, as ``abbe plan --instruments`` reads it; default: usual ones.
     progress : callable, optional
-        Receives `abbe.service.domain.progress.Progress` objects.
+        Receives `abbe.service.domain.progress.Progress` objects, each a line of text as `str`; e.g. ``print``.
 
     Raises
     ------

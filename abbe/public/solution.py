@@ -165,7 +165,7 @@ def solve(
         ``"rigid6"``: three scales and three squareness; ``"rigid21"``: 21 error motions; ``"auto"``: the model that predicts left-out
         set-ups and regions of the volume best. None: rigid21, or rigid6 with a flag if the readings are too few.
     progress : callable, optional
-        Receives one line of text per stage.
+        Receives one line of text per stage, e.g. ``print``.
 
     Raises
     ------

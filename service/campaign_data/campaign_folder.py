@@ -13,10 +13,11 @@ from abbe.service.domain.machine import DeviceUrls
 from abbe.service.domain.measured import CampaignHead
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import TableRemoval
-from abbe.service.errors import CampaignRefused
+from abbe.service.errors import CampaignRefused, Unusable
 from abbe.service.runs.cases import with_earliest_mounting
+from abbe.service.runs.checks import read_json
 from abbe.service.runs.columns import load_run
-from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder
+from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder, write_folder
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.store import Store
 
@@ -56,6 +57,22 @@ class Campaign:
         if missing:
             raise CampaignRefused(f"campaign {self.name} has no run {missing[0]}", f"it has {', '.join(names)}")
         return replace(self, runs=[r for r in self.runs if r.run_id not in labels])
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the campaign as a new folder, for the command line and for `read_campaign`, and return the folder.
+
+        Raises
+        ------
+        FileFormatError
+            The folder exists and is not empty, or cannot be written.
+        Unusable
+            A table was subtracted from the readings, or the campaign is one of the store with a file of errors.
+        """
+        errors = self.doc["current_model"]["errors"]
+        if self.removed is not None or (errors is not None and self.folder is None):
+            raise Unusable(f"campaign {self.name} is not as it was measured", f"`abbe export {self.name} --out FOLDER` writes a stored one")
+        known = None if errors is None or self.folder is None else read_json(self.folder / errors)
+        return write_folder(self.doc, self.runs, self.tables, known, Path(folder))
 
 
 def is_folder(campaign: str) -> bool:

@@ -32,6 +32,10 @@ class Progress:
     steps: Number = 0
     points: Number = 0
 
+    def __str__(self) -> str:
+        share = f"{self.done / self.total:4.0%} " if self.total > 0.0 else ""
+        return f"{share}{self.message or self.stage}" + ("" if self.eta_s is None else f", about {self.eta_s:.0f} s left")
+
 
 ProgressSink = Callable[[Progress], None]
 

@@ -7,7 +7,8 @@ import os
 import shutil
 import tempfile
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -177,10 +178,43 @@ def export_folder(store: Store, name_or_id: str | int, target: Path, images: Ima
     StoreError
         The store has no such campaign, or its samples are damaged.
     """
-    if target.exists() and (not target.is_dir() or any(target.iterdir())):
-        raise FileFormatError(f"{target} exists and is not an empty folder: nothing was written", "give a new folder")
     record = store.campaigns.find(name_or_id)
     runs = store.runs.all(record.id)
+    with _whole_folder(target) as folder:
+        _write_folder(store, record, runs, folder, images, csv=csv)
+    return target
+
+
+def write_folder(campaign: Doc, runs: list[Run], tables: Mapping[int, bytes], errors: Doc | None, target: Path) -> Path:
+    """Write runs and their campaign object as the folder ``target``, completely or not at all, and return the folder.
+
+    ``errors``: content of the errors file that the campaign object names.
+
+    Raises
+    ------
+    FileFormatError
+        The target exists and is not an empty folder, or cannot be written.
+    """
+    entries, setups = list[Doc](), dict[str, Doc]()
+    with _whole_folder(target) as folder:
+        for run in runs:
+            entry = {"run_id": run.run_id, "test": run.test, "role": run.role, "file": f"{_safe(run.run_id)}.json"}
+            entries.append(entry)
+            setups.setdefault(run.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": run.setup.t_set_s})
+            _write_json(folder / entry["file"], run.to_document())
+        for crc, image in tables.items():
+            _write_bytes(folder / table_file(crc), image)
+        if errors is not None:
+            _write_json(folder / str(campaign["current_model"]["errors"]), errors)
+        _write_json(folder / CAMPAIGN_FILE, campaign | {"setups": setups | campaign.get("setups", {}), "runs": entries})
+    return target
+
+
+@contextmanager
+def _whole_folder(target: Path) -> Iterator[Path]:
+    """Yield a folder beside the target, and rename it into place at the end."""
+    if target.exists() and (not target.is_dir() or any(target.iterdir())):
+        raise FileFormatError(f"{target} exists and is not an empty folder: nothing was written", "give a new folder")
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         aside = Path(tempfile.mkdtemp(prefix=f".{target.name}-", dir=target.parent))
@@ -188,7 +222,7 @@ def export_folder(store: Store, name_or_id: str | int, target: Path, images: Ima
         raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "give a writable folder") from None
     try:
         aside.chmod(0o755)  # mkdtemp creates private folders; other users may read an export
-        _write_folder(store, record, runs, aside, images, csv=csv)
+        yield aside
         if target.exists():
             target.rmdir()
         aside.rename(target)
@@ -196,7 +230,6 @@ def export_folder(store: Store, name_or_id: str | int, target: Path, images: Ima
         raise FileFormatError(f"{target}: cannot be written: {err.strerror}", "free disk space or give another folder") from None
     finally:
         shutil.rmtree(aside, ignore_errors=True)
-    return target
 
 
 def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path, images: Images, *, csv: bool) -> None:
@@ -223,10 +256,7 @@ def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], f
     _write_json(folder / CAMPAIGN_FILE, _campaign_document(store, record, entries, setups))
     for crc in _acting(written):
         if (image := images(crc)) is not None:
-            with (folder / table_file(crc)).open("wb") as file:
-                file.write(image)
-                file.flush()
-                os.fsync(file.fileno())
+            _write_bytes(folder / table_file(crc), image)
     if record.head.errors is not None and record.head.imported is not None:
         _write_json(folder / str(CampaignFile.read(record.head.imported).current_model.errors), record.head.errors)
 
@@ -251,18 +281,19 @@ def _safe(label: str) -> str:
     return "".join(one if one.isalnum() or one in "-_." else "_" for one in label)
 
 
-def _write_json(path: Path, document: Doc) -> None:
-    with path.open("w", encoding="utf-8", newline="\n") as file:
-        json.dump(document, file, ensure_ascii=False, allow_nan=False)
+def _write_bytes(path: Path, content: bytes) -> None:
+    with path.open("wb") as file:
+        file.write(content)
         file.flush()
         os.fsync(file.fileno())
+
+
+def _write_json(path: Path, document: Doc) -> None:
+    _write_bytes(path, json.dumps(document, ensure_ascii=False, allow_nan=False).encode())
 
 
 def _write_csv(path: Path, columns: Doc) -> None:
     """Columns of a run with all digits; a sealed column is left out."""
     known = {name: values for name, values in columns.items() if values is not None}
     rows = [",".join(known), *(",".join(map(repr, row)) for row in zip(*known.values(), strict=True))]
-    with path.open("w", encoding="utf-8", newline="") as file:
-        file.write("\n".join([*rows, ""]))
-        file.flush()
-        os.fsync(file.fileno())
+    _write_bytes(path, "\n".join([*rows, ""]).encode())

@@ -60,6 +60,26 @@ def test_the_solution_finds_what_was_simulated_within_its_uncertainty(solution: 
     assert solution.flags == ()
 
 
+def test_a_simulated_campaign_can_be_saved_for_the_command_line(campaign: abbe.Campaign, tmp_path: Path):
+    read = abbe.read_campaign(campaign.save(tmp_path / "june"))
+    assert read.name == campaign.name
+    assert [(r.run_id, r.role, r.columns.to_document()) for r in read.runs] == [
+        (r.run_id, r.role, r.columns.to_document()) for r in campaign.runs
+    ]
+    again = abbe.read_campaign(read.save(tmp_path / "again"))
+    assert [run.to_document() for run in again.runs] == [run.to_document() for run in read.runs]
+    with pytest.raises(abbe.AbbeError, match="not an empty folder"):
+        campaign.save(tmp_path / "june")
+
+
+def test_progress_can_be_printed(campaign: abbe.Campaign, capsys: pytest.CaptureFixture[str]):
+    abbe.solve(campaign, model="rigid6", progress=print)
+    abbe.plan(MACHINE, minutes=20.0, progress=print)
+    lines = capsys.readouterr().out.splitlines()
+    assert any("units, axes" in line for line in lines)
+    assert "  0% selecting the most informative measurements" in lines
+
+
 def test_the_deviation_between_two_points_is_the_machines(solution: abbe.Solution):
     rng = np.random.default_rng(4)
     points = MACHINE.stroke_mm[:, 0] + rng.uniform(0.1, 0.9, (200, 3)) * MACHINE.length_mm
