@@ -443,5 +443,5 @@ def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
     """Return the number of standstill readings in a whole run: those of its steps and the kept ones, except a last one that is read
     again. A qualification sphere is no reading."""
     count = sum(isinstance(s, ReadLaser | ReadBar) or (isinstance(s, TouchFeature) and not s.qualifies) for s in test.steps)
-    kept = sum(one.get("u_sphere_mm") is None for one in attempt.resume_trail.carried)
-    return {"standstills": count + (kept if attempt.resume_trail.again else max(0, kept - 1))} if count else {}
+    trail = attempt.resume_trail
+    return {"standstills": count + (trail.n_features if trail.again else max(0, len(trail.carried) - 1))} if count else {}

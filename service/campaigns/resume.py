@@ -180,7 +180,7 @@ class _Finder:
         kept = len(item.resume_trail.carried)
         how = f"resumes after point {kept}, which is read again" if kept else "begins again"
         if item.resume_trail.again:
-            how = f"resumes after {kept} features; the first one is touched again"
+            how = f"resumes after {item.resume_trail.n_features} features; the first one is touched again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
             how = f"resumes at {at} of its path, a stretch of which is read again"

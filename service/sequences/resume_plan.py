@@ -259,6 +259,11 @@ class ResumeTrail:
     carried: tuple[dict[str, Any], ...] = ()
     again: tuple[TouchFeature, ...] = ()
 
+    @property
+    def n_features(self) -> int:
+        """Number of carried features; a qualification sphere is none."""
+        return sum(one.get("u_sphere_mm") is None for one in self.carried)
+
 
 @dataclass(frozen=True, slots=True)
 class Attempt:

@@ -141,7 +141,7 @@ async def test_a_plate_that_slips_is_named_and_clamped_and_measured_anew(place):
     made = plan()
     await run(place, made, at(made, 2, lambda: b.sim.world.table.move(np.array([0.05, 0.0, 0.0]))))
     first, second = store.runs.all()
-    assert first.reason.startswith("SEQ-008: feature A1 moved by 50 um while 3 features were touched: the artefact is loose")
+    assert first.reason.startswith("SEQ-008: feature A1 moved by 50 um (features touched meanwhile: 3): the artefact is loose")
     assert (first.status, second.status) == ("failed", "complete")
     assert second.start_doc["setup"]["setup_id"] == "S-2"
     assert found(store) == ALL
@@ -336,7 +336,7 @@ async def test_a_stylus_that_changes_while_it_measures_is_named_when_the_first_f
     made = plan()
     await run(place, made, at(made, 2, worn(b, 0.02)))
     first, second = store.runs.all()
-    assert re.match(r"SEQ-008: feature A1: its radius changed by \+(19|20)\.\d ± \d\.\d um while 3 features were touched", first.reason)
+    assert re.match(r"SEQ-008: feature A1: its radius changed by \+(19|20)\.\d ± \d\.\d um \(features touched meanwhile: 3\)", first.reason)
     assert (first.status, second.status) == ("failed", "complete")
     assert second.start_doc["setup"]["setup_id"] == "S-2", "no point of the changed stylus is carried over"
     assert found(store) == ALL
@@ -364,7 +364,7 @@ async def test_after_a_pause_the_first_feature_is_touched_before_the_next_one(pl
 
     await run(place, made, Changing())
     first, second = store.runs.all()
-    assert re.match(r"SEQ-008: feature A1: its radius changed by .* while 2 features were touched", first.reason)
+    assert re.match(r"SEQ-008: feature A1: its radius changed by .* um \(features touched meanwhile: 2\)", first.reason)
     assert second.start_doc["setup"]["setup_id"] == "S-2"
 
 
