@@ -1,7 +1,8 @@
 """Split of the named error fields of a plane into errors of an artefact and errors of the machine, with U and evidence.
 
 The form of the artefact and the map of the machine are unknowns of one solution, and only the poses separate them. If the poses hide a
-field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors.
+field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors. So is that of a field
+which is certain in the reading, but neither in the part nor in the machine.
 
 Evidence: log of the Savage-Dickey ratio of a normal prior and posterior at zero, nats (Dickey 1971).
 """
@@ -105,7 +106,7 @@ def _verdict(seen: list[bool], *, hidden: bool) -> Verdict:
         return "unknown" if both else "none"
     if part and machine:
         return "with both"
-    return "with the part" if part else "with the machine" if machine else "none"
+    return "with the part" if part else "with the machine" if machine else "unknown" if both else "none"
 
 
 def _known(theta: F1, covariance: F2, weights: F1) -> tuple[float, float]:

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
+from abbe.models.solvers.artefact_shares import _verdict
 from abbe.models.solvers.observability.poses import NAMED, stated_places
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.cli.app import app
@@ -43,6 +44,11 @@ def test_the_amounts_of_part_and_machine_are_those_that_were_put_in(tmp_path: Pa
         if abs(m) > 1e-3 or abs(m) < 2e-4:
             assert (share.verdict in ("with the machine", "with both")) == (abs(m) > 1e-3), share
     assert "squareness" in found.verdict
+
+
+def test_what_only_the_reading_shows_is_unknown_and_not_none():
+    assert _verdict([False, False, True], hidden=False) == "unknown"
+    assert _verdict([False, False, False], hidden=False) == "none"
 
 
 def test_what_these_poses_hide_is_unknown_and_the_pose_that_tells_is_named(tmp_path: Path) -> None:
