@@ -8,7 +8,6 @@ it is two micrometres. Six holes and two poses suffice for this error: scales an
 from __future__ import annotations
 
 import asyncio
-import os
 import sys
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -145,7 +144,6 @@ def poses(name: str, where: Any, role: str) -> CampaignPlan:
     return CampaignPlan(name, tuple(t.plan(MACHINE) for t in tests))
 
 
-@pytest.mark.skipif(os.environ.get("ABBE_TEST_LONG") != "1", reason="takes minutes beside other tests (ABBE_TEST_LONG=1)")
 @pytest.mark.timeout(600)
 async def test_a_plate_maps_corrects_and_verifies_the_plane(instances, tmp_path):
     machine = instances()
