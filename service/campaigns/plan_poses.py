@@ -1,5 +1,6 @@
 """Plans the poses of an artefact for the minutes at hand: each pose adds the most information, and all touches stay inside the strokes.
 
+Holes lie flat, and the plan is judged in their plane. Balls may be tilted, too, and the plan is judged in the space that they can reach.
 The artefact file is TOML with one table ``[artefact.NAME]``, as at the end of a recipe.
 """
 
@@ -7,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +16,7 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.planning.measurements import Instruments
-from abbe.models.planning.poses import plane_uncertainty_mm
+from abbe.models.planning.poses import pose_uncertainty_mm
 from abbe.models.planning.problem import PlanningProblem, problem
 from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.models.solvers.observability.poses import SHIFT, PoseRank, pose_rank
@@ -26,7 +28,7 @@ from abbe.service.domain.run import ArtefactSetup, Columns, Run
 from abbe.service.errors import ConfigError, StrokeError
 from abbe.service.runs.artefact_points import artefact_data, calibrated_lengths
 from abbe.service.sequences.check import DryRun, dry_run
-from abbe.service.sequences.recipes.artefact import ArtefactTest
+from abbe.service.sequences.recipes.artefact import BALL, ArtefactTest
 from abbe.service.sequences.recipes.recipe_file import recipe_text
 from abbe.service.sequences.steps import TestPlan, TouchFeature
 from abbe.service.site import Site
@@ -37,7 +39,10 @@ MOUNT_MIN = 8.0
 U_MM = 4e-4
 """Assumed repeatability of a measured centre."""
 MARGIN_MM = 1.0
-NODES = 7
+NODES, LEVELS = 7, 4
+"""Points across and upwards at which a plan is judged."""
+TILT_DEG = 30.0
+"""Tilt of the tilted poses: a plate of 250 mm then reaches over 125 mm of Z, and its balls stay free for the stylus."""
 COVERAGE = 2.0
 
 
@@ -75,7 +80,7 @@ def read_artefact(path: Path) -> tuple[str, ArtefactObject]:
 
 
 def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, progress: ProgressSink = ignore_progress) -> PosePlan:
-    """Choose poses one after the other, by the fields that they show and then by U, until the minutes are used up.
+    """Choose poses one after the other until the minutes are used up: in a plane by the fields that they show and then by U, in space by U.
 
     Raises
     ------
@@ -86,15 +91,16 @@ def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, pro
     if not offered:
         raise ConfigError(f"artefact {name}: no pose has all its touches inside the strokes", "use a smaller artefact")
     what = problem(site.machine, Instruments(), ORDER)
-    points = _points(site, [plan for _, plan, _ in offered])
+    points = _points([plan for _, plan, _ in offered], LEVELS if _may_tilt(plate) else 1)
+    n_axes = 3 if np.ptp(points[:, 2]) else 2
     chosen, runs, used = list[PlannedPose](), list[Run](), 0.0
     while True:
         progress(Progress("plan", used, minutes, None, f"pose {len(chosen) + 1}"))
         rest = [(r, plan, dry) for r, plan, dry in offered if used + MOUNT_MIN + dry.duration_s / 60.0 <= minutes]
         if not rest:
             break
-        tried = [(*_known(what, (*runs, _expected(site, plan)), points), r, plan, dry) for r, plan, dry in rest]
-        rank, worst, mean, recipe, _, dry = min(tried, key=lambda one: (-(one[0].rank if one[0] else 0), one[2]))
+        tried = [(*_known(what, (*runs, _expected(site, plan)), points, n_axes), r, plan, dry) for r, plan, dry in rest]
+        rank, worst, mean, recipe, _, dry = min(tried, key=lambda one: (0 if n_axes == 3 or one[0] is None else -one[0].rank, one[2]))
         if chosen and mean > 0.98 * chosen[-1].u_mean_mm and (rank is None or chosen[-1].rank is None or rank.rank == chosen[-1].rank.rank):
             break
         label, cost = f"{name}-{len(chosen) + 1}", MOUNT_MIN + dry.duration_s / 60.0
@@ -109,13 +115,19 @@ def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, pro
 
 
 def _offered(site: Site, name: str, plate: ArtefactObject) -> Iterator[tuple[ArtefactTest, TestPlan, DryRun]]:
-    """Poses at quarter turns, at the ends and in the middle of X and Y, and shifted by a part of a pitch; those inside the strokes."""
+    """Poses at quarter turns, at the ends and in the middle of X and Y, and shifted by a part of a pitch; balls also tilted, unless the
+    stylus would meet one of them; those inside the strokes."""
     nominal = np.array([f.nominal_mm for f in plate.features])
     pitch = float(np.median(np.sort(np.linalg.norm(nominal[:, None] - nominal[None], axis=2), axis=1)[:, 1])) if len(nominal) > 1 else 0.0
-    height = float(site.machine.stroke_mm[2].mean())
-    for turn in (0.0, 90.0, 180.0, 270.0):
-        one = ArtefactTest("pose", "pose", "identify", name, (0.0, 0.0, height), rotation_deg=(0.0, 0.0, turn), plate=plate)
-        reach = np.array([p for s in one.plan(site.machine).steps if isinstance(s, TouchFeature) for p in s.places_mm()])
+    for tilt, turn in product((0.0, TILT_DEG) if _may_tilt(plate) else (0.0,), (0.0, 90.0, 180.0, 270.0)):
+        one = ArtefactTest("pose", "pose", "identify", name, (0.0, 0.0, 0.0), rotation_deg=(tilt, 0.0, turn), plate=plate)
+        height = round(float(site.machine.stroke_mm[2].mean() - one.matrix()[2] @ nominal.mean(axis=0)), 2)
+        try:
+            reach = np.array([p for s in one.plan(site.machine).steps if isinstance(s, TouchFeature) for p in s.places_mm()])
+        except ConfigError:
+            if tilt:
+                continue
+            raise
         low = site.machine.stroke_mm[:2, 0] - reach[:, :2].min(axis=0) + MARGIN_MM
         high = site.machine.stroke_mm[:2, 1] - reach[:, :2].max(axis=0) - MARGIN_MM
         steps = [sorted({a, 0.5 * (a + b), b, min(b, a + SHIFT * pitch)}) for a, b in zip(low, high, strict=True) if a <= b]
@@ -128,12 +140,17 @@ def _offered(site: Site, name: str, plate: ArtefactObject) -> Iterator[tuple[Art
                 continue
 
 
-def _points(site: Site, plans: list[TestPlan]) -> F2:
-    """Points over the part of the plane that the artefact can reach."""
+def _may_tilt(plate: ArtefactObject) -> bool:
+    return all(f.sensed == BALL for f in plate.features)
+
+
+def _points(plans: list[TestPlan], levels: int) -> F2:
+    """Points over what the artefact can reach: of the plane (one level), or of space."""
     reach = np.array([s.centre_mm for plan in plans for s in plan.steps if isinstance(s, TouchFeature)])
     low, high = reach.min(axis=0), reach.max(axis=0)
-    x, y = np.meshgrid(np.linspace(low[0], high[0], NODES), np.linspace(low[1], high[1], NODES), indexing="ij")
-    return np.stack([x.ravel(), y.ravel(), np.full(x.size, reach[:, 2].mean())], axis=1)
+    z = np.array([reach[:, 2].mean()]) if levels == 1 else np.linspace(low[2], high[2], levels)
+    nodes = np.meshgrid(np.linspace(low[0], high[0], NODES), np.linspace(low[1], high[1], NODES), z, indexing="ij")
+    return np.stack([n.ravel() for n in nodes], axis=1)
 
 
 def _expected(site: Site, plan: TestPlan) -> Run:
@@ -151,10 +168,10 @@ def _expected(site: Site, plan: TestPlan) -> Run:
     return run.with_artefact({"artefacts": plan.artefact})
 
 
-def _known(what: PlanningProblem, runs: tuple[Run, ...], points: F2) -> tuple[PoseRank | None, float, float]:
+def _known(what: PlanningProblem, runs: tuple[Run, ...], points: F2, n_axes: int) -> tuple[PoseRank | None, float, float]:
     named = [_data(f"p{k}", run) for k, run in enumerate(runs)]
     data = (*named, *calibrated_lengths(list(runs)))
-    return pose_rank(data), *plane_uncertainty_mm(what, data, points, DEFAULT_SIGMA_MM["artefact"])
+    return pose_rank(data), *pose_uncertainty_mm(what, data, points, DEFAULT_SIGMA_MM["artefact"], n_axes)
 
 
 def _data(name: str, run: Run) -> RunData:
@@ -169,8 +186,8 @@ def pose_rows(plan: PosePlan) -> list[tuple[str, ...]]:
     """Return a row for each pose: where, minutes, fields shown, U = 2 u afterwards, µm."""
     rows: list[tuple[str, ...]] = []
     for k, p in enumerate(plan.poses, start=1):
-        x, y, z = p.recipe.origin_mm
-        where = f"zero at X {x:g} Y {y:g} Z {z:g}, turned by {p.recipe.rotation_deg[2]:g}°"
+        (x, y, z), (tilt, _, turn) = p.recipe.origin_mm, p.recipe.rotation_deg
+        where = f"zero at X {x:g} Y {y:g} Z {z:g}, turned by {turn:g}°" + (f", tilted by {tilt:g}°" if tilt else "")
         fields = "" if p.rank is None else f"{p.rank.rank} of {p.rank.of}"
         u = (f"{COVERAGE * p.u_worst_mm * 1e3:.3g}", f"{COVERAGE * p.u_mean_mm * 1e3:.3g}")
         rows.append((str(k), where, f"{p.minutes:.1f}", f"{p.until_min:.1f}", fields, *u))

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
 
-from abbe.service.campaigns.plan_poses import plan_poses, pose_doc, pose_rows, read_artefact
+from abbe.service.campaigns.plan_poses import TILT_DEG, _offered, plan_poses, pose_doc, pose_rows, read_artefact
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.errors import ConfigError
@@ -18,9 +19,9 @@ from tests.faults.sequencer_world import MACHINE
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())
 
 
-def plate(pitch_mm: float = 60.0, columns: int = 4) -> ArtefactObject:
+def plate(pitch_mm: float = 60.0, columns: int = 4, sensed: str = "xy", radius_mm: float = 10.0) -> ArtefactObject:
     features = [
-        {"id": f"{'ABCDEF'[i]}{j + 1}", "nominal_mm": [pitch_mm * i, pitch_mm * j, 0.0], "sensed": "xy", "radius_mm": 10.0}
+        {"id": f"{'ABCDEF'[i]}{j + 1}", "nominal_mm": [pitch_mm * i, pitch_mm * j, 0.0], "sensed": sensed, "radius_mm": radius_mm}
         for j in range(columns)
         for i in range(columns)
     ]
@@ -42,6 +43,23 @@ def test_every_pose_fits_tells_more_and_is_paid_for():
     for recipe in recipes:
         dry_run(MACHINE, recipe.plan(MACHINE))
     assert len(pose_rows(found)) == len(pose_doc(found)["poses"]) == len(recipes)
+
+
+def test_balls_are_tilted_too_and_that_tells_more_of_space_than_flat_poses_do():
+    found = plan_poses(SITE, "A", plate(80.0, 2, "xyz"), 40.0)
+    tilts = [p.recipe.rotation_deg[0] for p in found.poses]
+    assert tilts[0] == 0.0
+    assert TILT_DEG in tilts
+    (_, before), (tilted, after) = next((a, b) for a, b in pairwise(zip(tilts, found.poses, strict=True)) if b[0])
+    assert after.u_mean_mm < 0.98 * before.u_mean_mm
+    assert "tilted by 30°" in pose_rows(found)[tilts.index(tilted)][1]
+    for recipe in parse_recipe(found.text, "plan.toml")[1]:
+        dry_run(MACHINE, recipe.plan(MACHINE))
+
+
+def test_balls_that_the_stylus_would_meet_when_tilted_lie_flat():
+    found = list(_offered(SITE, "A", plate(24.0, 2, "xyz", 8.0)))
+    assert {recipe.rotation_deg[0] for recipe, _, _ in found} == {0.0}
 
 
 @pytest.mark.parametrize(
