@@ -122,7 +122,7 @@ class Command(DeviceTable):
 
     address: Register | None = None
     write: tuple[Word, ...] = ()
-    function: Literal[3, 4] = Field(default=3, description="Modbus: function code that reads numbered and acknowledge")
+    function: Literal[3, 4] = Field(default=3, description="Modbus: function code for reading the registers numbered and acknowledge")
     numbered: Register | None = None
     acknowledge: Register | None = None
     becomes: Word = 0
@@ -137,7 +137,7 @@ class ModbusTable(DeviceTable):
     order: Order = Field(description="bytes of a value of two registers: ABCD is high register first, CDAB low register first")
     function: Literal[3, 4] = Field(default=3, description="function code of reads")
     write_function: Literal[6, 16] = Field(default=16, description="function code of writes; 6 writes one register")
-    baud: int | None = Field(default=None, ge=300, le=12_000_000, description="RTU; replaces that of the URL")
+    baud: int | None = Field(default=None, ge=300, le=12_000_000, description="RTU; replaces the baud rate in the URL")
     parity: Literal["none", "even", "odd"] | None = None
     timeout_s: float = Field(default=1.0, gt=0, le=10)
 
@@ -152,7 +152,7 @@ class LineTable(DeviceTable):
     error: Pattern = Field(default="", description="regular expression of a line that reports an error")
     who: Text = Field(default="", description="sent to ask for the identity")
     answers: Pattern = Field(default="", description="regular expression of the identity; a group serial_no is kept")
-    baud: int | None = Field(default=None, ge=300, le=12_000_000, description="serial; replaces that of the URL")
+    baud: int | None = Field(default=None, ge=300, le=12_000_000, description="serial; replaces the baud rate in the URL")
     parity: Literal["none", "even", "odd"] | None = None
     bits: Literal[7, 8] = 8
     stop: Literal[1, 2] = 1
@@ -178,7 +178,7 @@ class DeviceFile(DeviceTable):
     source: str = Field(default="", description="manual and chapter that this file was written from")
     air: Literal["no light", "compensated", "vacuum"] = Field(
         default="no light",
-        description="displacement: no light in air; light, corrected for the air by the device; light, vacuum wavelength (refused)",
+        description="of a displacement: it uses no light; light, and the device corrects for the air; light, not corrected (refused)",
     )
     modbus: ModbusTable | None = None
     line: LineTable | None = None

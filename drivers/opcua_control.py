@@ -68,7 +68,7 @@ class OpcUaControl(ListenedControl):
         unit_id = (await self._ask("identify", node.read_value())).UnitId
         found = UNECE.get(unit_id, "")
         if not found or (self._unit and found != self._unit):
-            what = found or f"of unit {unit_id}, which is no length known here"
+            what = found or f"unit {unit_id}, which is no unit of length known here"
             raise WrongDevice(
                 self.name, "identify", f"the position of {axis.upper()} is in {what}; the URL states {self._unit or 'no unit'}"
             )

@@ -208,20 +208,20 @@ class Material(ConfigTable):
         default=AxisUncertainties(), description="its standard uncertainty, 1/K, for each axis with a coefficient, e.g. {X = 0.6e-6}"
     )
     temperature_c: Annotated[float, Field(ge=COLDEST_C, le=WARMEST_C)] | None = Field(
-        default=None, description="temperature of the scales, for runs that recorded none of their axis (temp_x_C, temp_y_C, temp_z_C)"
+        default=None, description="temperature of the scales, for runs that did not record it for their axis (temp_x_C, temp_y_C, temp_z_C)"
     )
     u_temperature_k: Annotated[float, Field(ge=0.0, le=10.0)] = Field(
         default=0.2, description="standard uncertainty of the scales' temperature, recorded or stated"
     )
     laser_per_k: Coefficient = Field(
         default=0.0,
-        description="coefficient to which the laser's own compensation of material expansion is set, at the same temperature, 1/K; 0: it "
-        "is off, the laser reads true length",
+        description="expansion coefficient set in the laser's own compensation of material, 1/K; its sensor is taken to be as warm as the "
+        "scales; 0: the compensation is off, the laser reads true length",
     )
     workpiece_per_k: Coefficient | None = Field(
         default=None,
-        description="expansion coefficient of the workpieces, 1/K: reports then also show the deviations that a part, made as warm as the "
-        "scales, has at 20 °C",
+        description="expansion coefficient of the workpieces, 1/K: reports then also show the deviations at 20 °C of a part that was made "
+        "at the temperature of the scales",
     )
     u_workpiece_per_k: CoefficientUncertainty | None = Field(default=None, description="its standard uncertainty, 1/K")
 
@@ -263,7 +263,7 @@ class Calibration(ConfigTable):
         default=None, description="of the probed artefact's length; without a calibrated length, of the touch probe's test (ISO 230-10)"
     )
     artefact_is: str = Field(default="", max_length=400, description="the same for the artefact")
-    room: Certificate = Field(default=None, description="of room_temperature_c: until when it was confirmed for the room")
+    room: Certificate = Field(default=None, description="of room_temperature_c: last day for which somebody confirmed it")
     room_temperature_c: Temperatures | None = Field(
         default=None,
         description="lowest and highest air temperature by the room's own thermometer, at most 1 K apart; only for a machine without a "
@@ -276,7 +276,9 @@ class Calibration(ConfigTable):
             raise ValueError("room and room_temperature_c belong together, expected both or neither")
         if self.room_temperature_c is not None and self.room_temperature_c[1] - self.room_temperature_c[0] > ROOM_K + 1e-9:
             low, high = self.room_temperature_c
-            raise ValueError(f"room_temperature_c is {low:g} to {high:g}, expected at most {ROOM_K:g} K: verifications need as much")
+            raise ValueError(
+                f"room_temperature_c is {low:g} to {high:g}, expected at most {ROOM_K:g} K from lowest to highest, as verifications need"
+            )
         return self
 
     def until(self) -> dict[str, date]:
@@ -374,7 +376,7 @@ class Web(ConfigTable):
         if bool(self.certificate) != bool(self.key):
             raise ValueError("certificate and key belong together, expected both or neither")
         if self.behind_tls and not self.names:
-            raise ValueError("behind_tls: add to names the host name of the proxy that browsers use")
+            raise ValueError("behind_tls = true needs names: add the host name under which browsers reach the proxy")
         return self
 
 
@@ -389,7 +391,7 @@ class OpcUa(ConfigTable):
     )
     port: int = Field(default=4840, ge=0, le=65535, description="0: any free port")
     certificate: str = Field(
-        default="", description="of this server, PEM file (relative to the machine file's folder); empty: not encrypted"
+        default="", description="TLS certificate of this server, PEM file (relative to the machine file's folder); empty: not encrypted"
     )
     key: str = Field(default="", description="private key of the certificate, PEM file")
     clients: tuple[str, ...] = Field(

@@ -343,7 +343,7 @@ class SerialBallBar:
                 self._attach(None)
                 self._streaming = False
         if not through:  # another error already marks the run as incomplete
-            waited = Backpressure(self.name, "end stream", f"samples are not stored {_DRAIN_S:g} s after the box stopped", SLOW)
+            waited = Backpressure(self.name, "end stream", f"samples are still not stored {_DRAIN_S:g} s after the box stopped", SLOW)
             self.incidents.note(waited)
             raise waited
 

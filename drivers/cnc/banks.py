@@ -234,7 +234,9 @@ class Banks(ControllerSession):
         await self._bank_command(reg.ACTIVATE, operation, bank=bank, expect_crc=expect_crc, expect_gen=expect_gen, owner=owner)
         active = (await self._comp_counts())["ACTIVE_BANK"]
         if active != bank:
-            raise DeviceFault(self.name, operation, f"acknowledged, but bank {active} is active", "do not measure; look at the controller")
+            raise DeviceFault(
+                self.name, operation, f"the controller acknowledged, but bank {active} is active", "do not measure; look at the controller"
+            )
 
     async def _bank_command(self, command: int, operation: str, *, anyway: bool = False, **fields: int) -> None:
         """Send a command to the banks and determine its outcome.

@@ -240,7 +240,9 @@ def summary(report: TestReport) -> str:
     if report.failed:
         return "it cannot be used: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:
-        return "it can measure: its readings count at standstills, of an operator's NC program or of a motion that Abbe commands"
+        return (
+            "it can measure: its readings count while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
+        )
     return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED)
 
 

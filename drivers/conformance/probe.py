@@ -47,7 +47,7 @@ CALL_S = 10.0
 
 
 class DriverDefect(Exception):  # noqa: N818 - what it says is not an error of the device
-    """A driver broke a rule: a call never ended, or raised another error than those of `abbe.drivers.errors`."""
+    """A driver broke a rule: a call never ended, or raised an error that is not in `abbe.drivers.errors`."""
 
 
 async def watched(operation: str, call: Awaitable[T]) -> T:

@@ -59,7 +59,7 @@ async def open_source(url: DeviceUrl, file: DeviceFile) -> DeviceSource:
         link_ = ByteLink(url, bits=file.line.bits, stop=file.line.stop)
         return PolledLines(file, link_) if file.line.mode == "poll" else StreamedLines(file, link_)
     wanted = "modbus+tcp:// or modbus+rtu://" if file.modbus is not None else "serial:// or socket://"
-    raise BadUrl(ascii(str(url)), "open device", "the device file describes another wire", f"write {wanted}")
+    raise BadUrl(ascii(str(url)), "open device", "the device file is for another kind of line", f"write {wanted}")
 
 
 async def open_meter(url: DeviceUrl, *, needed: Ability | None = None) -> DescribedMeter:

@@ -113,4 +113,4 @@ def check_tested(device: str, path: str, sha256: str, serial_no: str, needed: Ab
         raise NotProved(device, f"open to {needed}", detail, remedy)
     if needed not in abilities:
         why = "; ".join(f"{check}: {text}" for check, verdict, text in findings if verdict != CheckVerdict.PASSED)
-        raise NotProved(device, f"open to {needed}", f"its test did not prove it: {why}", remedy)
+        raise NotProved(device, f"open to {needed}", f"its device test did not prove this: {why}", remedy)

@@ -58,7 +58,7 @@ class NamedEffect:
     alternatives : rivals that the data cannot exclude, (label, missing log evidence), best first.
     location : where its signal is largest.
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
-    needed : rms of the holdout runs without this effect, divided by that with it; 1 or less: not needed. None: there is no holdout run, or
+    needed : rms of the holdout runs without this effect, divided by their rms with it; 1 or less: not needed. None: no holdout run, or
     the effect is a variance effect, which changes no mean reading.
     sensor_doubt : why the temperature column of the warming part probably belongs to another part; empty without doubt.
     """
@@ -164,7 +164,7 @@ class Discovery:
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
     alone : the result without any effect; given if chance may also yield names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
-    left_out : gap of the fitted runs on blocks left out in turn (`abbe.models.discovery.left_out`); None if there are holdout runs.
+    left_out : gap of the fitted runs, each predicted without its block (`abbe.models.discovery.left_out`); None if there are holdout runs.
     residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
     predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
     noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.
@@ -174,7 +174,7 @@ class Discovery:
     unjudged : holdout runs that cannot be judged.
     unseen : blind spots of the runs, if nothing was found.
     fitted : significant errors that the present simulation already includes (the scale of a single axis).
-    doubt : probable fault of the data of the runs in ``location``, as text; with such a fault nothing was searched.
+    doubt : probable fault in the data of the runs in ``location``, as text; if there is one, no effect was searched.
     """
 
     verdict: Verdict

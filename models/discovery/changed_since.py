@@ -96,7 +96,7 @@ def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
 
 
 def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
-    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus that for zero unknowns."""
+    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus the one if all unknowns are zero."""
     if not base.shape[1]:
         return 0.0
     inside = base.T @ gram @ base

@@ -52,7 +52,7 @@ def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[Variance
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """Remove variance effects from a problem: project vibrations out of each ball-bar run, give readings with excess scatter weight 0."""
+    """Remove variance effects: project vibrations out of each ball-bar run, and give weight 0 to readings with excess scatter."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":
@@ -127,7 +127,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
 
 
 def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
-    """Search for mean and variance effects, refit noise and simulation, repeat (up to `ROUNDS` times) until the findings stay the same."""
+    """Search for mean and variance effects and refit noise and simulation, up to `ROUNDS` times, until the findings stay the same."""
     contest = Contest.of(problem, effects)
     found, loud = selected(contest), tuple[VarianceFinding, ...]()
     for i in range(ROUNDS):
@@ -179,7 +179,7 @@ def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) 
 
 
 def settled(problem: WhitenedProblem, picks: list[Pick]) -> WhitenedProblem:
-    """Linearise the problem about the joint fit of simulation and picks, and estimate the noise from the residuals of this fit."""
+    """Fit simulation and chosen effects (``picks``) together, linearise the problem there, and estimate the noise from the residuals."""
     if not picks:
         return with_estimated_noise(problem, (), memory=True)
     raw = [p.raw(problem) for p in picks]

@@ -100,7 +100,7 @@ def _slope(effect: Effect, c: F1, cov: F2, pick: Pick) -> F1:
 
 
 def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2:
-    """Return the matrix from the coefficients of a pick, forms included, to coefficients of the plain effect with the nearest signal.
+    """Return the matrix that turns coefficients of a pick (forms included) into coefficients of the plain effect with the nearest signal.
 
     "Nearest" is by least squares. Shape: (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's
     size count: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic
@@ -234,9 +234,7 @@ def _judge(
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
-        rejected += [
-            (e.label, f"evidence {e.evidence:.0f}, less than that of the structures without a name: not named beside them") for e in effects
-        ]
+        rejected += [(e.label, f"evidence {e.evidence:.0f}, less than the structures without a name have: not named") for e in effects]
     for i, j in companion.items():
         share_text = f"evidence {found[i].score / 2.0:.0f}: possibly only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))
@@ -247,7 +245,7 @@ def _judge(
 def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
     """Give the reason, by label, against effects that may be a part of what all findings leave without explanation (`REST_SHARE`)."""
     return {
-        e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} is left without explanation: possibly only a part of that"
+        e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} stays unexplained: possibly only a part of what is unexplained"
         for e in effects
         if e.evidence < REST_SHARE * rest
     }
@@ -385,8 +383,10 @@ def _next_test(problem: WhitenedProblem, judged: _Judgement, solved: SolvedModel
 
 
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
-    """Count the scatter of variance effects in the fitted runs as noise of all roles: it cannot be predicted, so a name for it closes
-    no gap."""
+    """Add the scatter of variance effects in the fitted runs to the noise floor of every role.
+
+    Nobody can predict this scatter, so its name closes no gap.
+    """
     fitted = gaps["identify"]
     scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)
     return {role: replace(g, floor_mm=float(np.sqrt(g.floor_mm**2 + scatter))) for role, g in gaps.items()}

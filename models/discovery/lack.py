@@ -102,7 +102,7 @@ def _about_mean(differences: F1) -> F1:
 def lack_of_fit(
     problem: WhitenedProblem, left_mm: Mapping[str, F1], floor: Mapping[str, Floor], agreement: Sequence[Agreement]
 ) -> Localization | None:
-    """Locate residuals of a solution without effects that exceed noise; None without any.
+    """Find where the residuals of a solution without effects exceed noise; None if they do not.
 
     Parameters
     ----------
@@ -131,7 +131,7 @@ def lack_of_fit(
 
 
 def unexplained(problem: WhitenedProblem, picks: Sequence[Pick], floor: Mapping[str, Floor], calm: F1) -> float:
-    """Return the residuals of picks and simulation above the noise ``floor``, in nats of the search; 0 up to `TIMES` the floor.
+    """Return by how much residuals of simulation and ``picks`` exceed the noise ``floor``, in nats; 0 if they are below `TIMES` floor.
 
     ``calm``: weight of each reading, shape (n,), 0 for readings with scatter from a known effect.
     """

@@ -1,4 +1,4 @@
-"""Share of the gap that a finding closes on blocks of runs left out in turn, for campaigns without holdout runs."""
+"""How much of the gap a finding closes on fitted runs, left out block by block; for campaigns without holdout runs."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[s
     """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None if a finding has no mean effects.
 
     Unknowns of the simulation and coefficients of the effects are fitted anew without the block. Selection and non-linear parameters
-    of the effects come from all readings: weaker evidence than a holdout run, stronger than residuals.
+    of the effects come from all readings. So this proves less than a holdout run, and more than the residuals of the fit.
     """
     if not solved.picks:
         return None

@@ -64,13 +64,12 @@ def residues(
 ) -> Mapping[str, str]:
     """Find named effects that may be mere residues: deviations of a stronger effect from its formula.
 
-    An effect is a residue if its evidence is below
+    An effect is a residue if its evidence is below this share of the evidence of
 
-    - 0.1 % of that of any stronger effect;
-    - for stick-slip and vibration: 1 % of that of an effect at reversals or a cyclic error, 0.3 % of that of another mean effect;
-    - 1 % of that of an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo
-      mismatch);
-    - 3 % of that of a related effect: another thermal effect (bar included), a curve over the same axis or in the same direction (also
+    - any stronger effect: 0.1 %;
+    - for stick-slip and vibration, an effect at reversals or a cyclic error: 1 %; another mean effect: 0.3 %;
+    - an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo mismatch): 1 %;
+    - a related effect: 3 %. Related are another thermal effect (bar included), a curve over the same axis or in the same direction (also
       positioning and thermal growth of the same axis), another lag of the drives, another scale of the laser.
 
     Parameters
@@ -89,14 +88,14 @@ def residues(
         for big in sorted(effects, key=lambda e: -e.evidence):
             share, whole = _share(small, big, big.label in scatter), max(big.evidence, without.get((big.label, small.label), 0.0))
             if small.evidence <= CLEARLY_WEAKER * big.evidence and small.evidence < share * whole:
-                share_text = f"evidence {small.evidence:.0f}, only {small.evidence / whole:.1%} of that of {big.label}"
+                share_text = f"evidence {small.evidence:.0f}, only {small.evidence / whole:.1%} of the evidence of {big.label}"
                 out[small.label] = f"{share_text}: possibly only the deviation of {big.label} from its formula"
                 break
     return out
 
 
 def ties(effects: Sequence[NamedEffect], scatter: frozenset[str], without: Mapping[tuple[str, str], float]) -> frozenset[tuple[str, str]]:
-    """Find pairs of effects of which one may be the residue of the other, but the readings do not say which one.
+    """Find pairs of effects in which one may be the residue of the other, but the readings do not show which one.
 
     Their shared evidence is large enough for a residue (`residues`), but neither effect is clearly weaker than the other. Each pair of
     labels is given in both orders. For the parameters see `residues`.
@@ -150,7 +149,7 @@ def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[s
         if f.pick.unnamed or _scores(problem, f, others):
             continue
         leant = sorted(g.label for g in gone if _scores(problem, f, [*others, g])) or sorted(g.label for g in gone)
-        out[f.pick.label] = f"evidence {f.score / 2.0:.0f}, but none without {', '.join(leant)}, not named either"
+        out[f.pick.label] = f"evidence {f.score / 2.0:.0f}, but none without the rejected {', '.join(leant)}"
     return out
 
 
@@ -160,7 +159,7 @@ def _scores(problem: WhitenedProblem, f: Selection, beside: Sequence[Pick]) -> b
 
 
 def companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:
-    """Map the index of each finding that is only a residue to the index of the finding of which it is a residue."""
+    """Return, for each finding that is only a residue, its index and the index of the finding that it comes from."""
     power = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
         size = problem.white(pick.raw(problem) @ c[:, None])[:, 0] ** 2

@@ -18,7 +18,7 @@ stays below the second. In the practice set every own column reaches 0.999."""
 
 
 def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values) -> str:
-    """Return a warning if another temperature column follows a named growth and the growing part's own does not; empty without such doubt.
+    """Return a warning if a named growth follows another temperature column and not the one of the growing part; empty otherwise.
 
     Parameters
     ----------

@@ -115,7 +115,7 @@ _AGAIN = _Plan(
 _PERIOD = _Plan(
     ("second_feed",),
     ("a period of time", "a period of position"),
-    "at another feed a period of time keeps its seconds, a period of position its millimetres; reading the instrument at "
+    "at another feed, a period of time stays the same in seconds, a period of position in millimetres; reading the instrument at "
     "standstill{standstill} shows whether the wave needs motion",
 )
 _BUMP = _Plan(

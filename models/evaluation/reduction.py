@@ -11,8 +11,9 @@ reading of its own sensor of material temperature. Let the scale be at T, t = T 
 b (T + e_L - 20), the correction removes (a - b) (T + e - 20), and -(a - b) e - b e_L remains. The errors e and e_L are independent and
 have the same u(t).
 
-A workpiece of coefficient w is as warm as the scale when it is made, and shrinks when it cools down: for dimensions at 20 °C of such parts,
-w (t - 20) is taken off in place of a (t - 20). Along a diagonal every axis counts with the square of its share of the direction.
+A workpiece of coefficient w has the temperature of the scale when it is made, and shrinks when it cools down: for dimensions at 20 °C of
+such parts, w (t - 20) is taken off in place of a (t - 20). Along a diagonal every axis counts with the square of its share of the
+direction.
 """
 
 from __future__ import annotations

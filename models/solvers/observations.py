@@ -137,8 +137,8 @@ def block_average(run: RunData, blocks: int) -> RunData:
     """Average the run to about ``blocks`` values, each the mean of up to ceil(n / blocks) consecutive readings moving in one direction.
 
     Blocks never span a reversal, where averaging would hide lost motion; every reversal may add one value to ``blocks``. The averaged value
-    is the reading minus that of a perfect machine (`nominal_reading`), because the mean of points on a sphere lies inside the sphere. A run
-    of at most ``blocks`` readings is returned unchanged.
+    is the reading minus the reading of a perfect machine (`nominal_reading`), because the mean of points on a sphere is inside the sphere.
+    A run of at most ``blocks`` readings is returned unchanged.
 
     The mean leaves out a reading that is farther from its block's median than `REJECT_SIGMA` times the largest of three standard
     deviations: the noise of the whole run (second differences), the block's own spread (median absolute deviation; so a steady change

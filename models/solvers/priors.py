@@ -139,10 +139,10 @@ NODES = 160
 def smooth_shapes(order: int, length: float, ends: float = ENDS_SHARES[0]) -> tuple[F2, F1]:
     """Shapes of an error motion and their variances: the prior covariance of its Legendre coefficients of order 2 to ``order``.
 
-    The coefficients are those of a stationary process with Matern 3/2 correlation of about ``length`` strokes, log-normal with
-    `LENGTH_SPREAD`, and with the share ``ends`` of its variance in independent coefficients, which are largest at the ends. A smoother
-    correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would determine its ends. The shapes are
-    the eigenvectors of the coefficients' covariance.
+    The coefficients are those of a stationary process with Matern 3/2 correlation. Its correlation length is log-normal: about ``length``
+    strokes, with the spread `LENGTH_SPREAD`. The share ``ends`` of the variance is in independent coefficients, which are largest at the
+    ends. A smoother correlation (squared exponential) makes motions analytic: readings in the middle of a stroke would determine its ends.
+    The shapes are the eigenvectors of the coefficients' covariance.
 
     Returns
     -------

@@ -26,7 +26,7 @@ NODES = 5
 
 
 def scale_projection(machine: Machine, terms: tuple[Term, ...], scales: Scales) -> F2:
-    """Return the matrix that takes coefficients to those of the map without its best-fit scale over the volume, shape (terms, terms).
+    """Return the matrix that removes the best-fit scale over the volume from a map: coefficients to coefficients, shape (terms, terms).
 
     Scale and rigid motion are fitted together over an even grid over the strokes. The rigid motion stays in the map.
 

@@ -93,7 +93,7 @@ def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
         worst = max(meets, key=lambda k: len(meets[k]))
         others = meets.pop(worst)
         meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
-        what = f"its t_s lies within that of {_named(others)}: one machine cannot measure two runs at a time"
+        what = f"its times (t_s) lie within those of {_named(others)}: one machine cannot measure two runs at a time"
         out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: Abbe needs this to judge drift", False))
     if len(out) > 1 and 2 * len(out) >= len(spans):
         what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
@@ -147,7 +147,7 @@ def _feed_of_path(run: Run) -> list[CampaignIssue]:
     if driven <= 0.0 or abs(driven / feed - 1.0) <= OTHER_FEED:
         return []
     what = f"feed_mm_min states {feed:.0f}, but its positions and times give {driven:.0f} mm/min, which is used"
-    return [CampaignIssue(run.run_id, what, "correct the column, or exchange it with that of the right run", False)]
+    return [CampaignIssue(run.run_id, what, "correct the column, or replace it by the column of the right run", False)]
 
 
 COPIED_SHARE = 0.98
@@ -371,7 +371,7 @@ def _too_few(run: Run, count: int) -> list[CampaignIssue]:
         return []
     what = (
         f"only {count} valid readings on {turns:g} turns, expected {wanted} or more: "
-        "cup position, bar length and lost motion leave too few for the errors of the machine"
+        "the fit of cup position, bar length and lost motion leaves too few for the errors of the machine"
     )
     return [CampaignIssue(run.run_id, what, "measure it again with a higher rate", False)]
 

@@ -110,12 +110,14 @@ def _direction(test: str, setup: LaserSetup, span: F1) -> GeometryMistake | None
     """Check beam, axis, letters of the diagonal and increments against the line from start to end."""
     if test == "laser_linear" and setup.axis and not span.any():
         stood = "the axis stood still: its readings over time hold no geometry; only a report shows them"
-        remedy = "leave the run out (--without); such runs alone, with temperatures, show the thermal response (abbe discover)"
+        remedy = (
+            "leave the run out (--without); abbe discover takes a campaign of such runs with temperatures, and shows the thermal response"
+        )
         return GeometryMistake(stood, remedy)
     unit = span / max(float(np.linalg.norm(span)), 1e-9)
     beam = setup.nominal_beam
     if beam is not None and float(np.dot(beam, unit)) < 0.999 * float(np.linalg.norm(beam)):
-        return GeometryMistake("nominal_beam does not point from start_mm to end_mm", "correct the set-up: exchanged or reversed axes")
+        return GeometryMistake("nominal_beam does not point from start_mm to end_mm", "look in the set-up for exchanged or reversed axes")
     if test == "laser_linear" and not setup.axis:
         return GeometryMistake("its set-up states no axis", "state axis: X, Y or Z")
     if test == "laser_linear" and abs(unit["XYZ".index(setup.axis)]) < 0.999:

@@ -411,7 +411,7 @@ async def recording(
     if recorder.behind:
         raise StoreError(
             f"the database did not take all samples within {CATCH_UP_S:g} s; they are safe in {recorder.log.segment.path}",
-            "check the database; the next `abbe` command that connects to the machine stores them there",
+            "check the database; the next `abbe` command that connects to the machine stores the samples in the database",
         )
 
 

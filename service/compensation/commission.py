@@ -74,7 +74,9 @@ class CommissioningContext:
         wanted = WantedTable(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
         await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, KIND, read, read))
         if not found:
-            raise TableMismatch("the controller changed before the places were read", "look at the controller, then begin again")
+            raise TableMismatch(
+                "the controller or its tables changed before the ball-bar was read", "look at the controller, then begin again"
+            )
         return found[0]
 
 
@@ -121,7 +123,7 @@ def _steps(context: CommissioningContext, base: Base, lsb_nm: int) -> _Steps:
     small_mm, step_mm = (max(round(s / lsb_mm), 1) * lsb_mm for s in (FIRST_MM, STEP_MM))
     if small_mm * LARGEST_RATIO > STROKE_MM:
         raise TableRefused(
-            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: a control that reads it as mm would exceed the bar's stroke",
+            f"the control's unit of {lsb_mm * 1e3:g} µm is too coarse: if the control takes it as mm, a step leaves the bar's stroke",
             "prove sign and unit with a dial indicator, with the axis clear of all obstacles; nothing was written",
         )
     tables = _base_tables(context.site, base)
@@ -139,11 +141,11 @@ async def _prove(context: CommissioningContext, base: Base, steps: _Steps) -> Si
     moved_mm = float(np.abs(first.deviation_mm - before.deviation_mm).max())
     if moved_mm > HARMLESS * max(steps.small_mm, FIRST_MM):
         moved = f"a step of {steps.small_mm * 1e3:g} µm moved the tool by {moved_mm * 1e3:.1f} µm"
-        what = f"{moved}: the control takes the values of its tables for another unit"
+        what = f"{moved}: the control reads the values of its tables in another unit"
         campaign = await asyncio.to_thread(context.store.campaigns.find, f"{context.bar.name} before")
         doc = {"step_mm": steps.small_mm, "faults": [what], "proved": False}
         await context.store.write(context.store.solutions.add, campaign.id, KIND, context.bar.run_ids, doc)
-        raise TableRefused(what, "the old table is in force; look up the unit of the control's tables")
+        raise TableRefused(what, "the old table is in force; look up the unit of the tables in the control's manual")
     read = [await context.read_with_table(AXES[axis], steps.each[axis], base, steps.lsb_nm) for axis in range(3)]
     after = await context.bar.read("after")
     return sign_proof(steps.step_mm, _shifts(context.bar.directions(before), before, read, after))

@@ -349,7 +349,12 @@ async def _two_banks(t: Trial) -> bool:
         t.fail("two_banks", f"the inactive bank refuses writes: {why}")
         return False
     apart = await c.read_bank(1 - now.active_bank, len(image)) == marked and await c.read_bank(now.active_bank, len(image)) == image
-    t.judge("two_banks", apart, "a write into the inactive bank changes only that bank", "a write does not change the inactive bank alone")
+    t.judge(
+        "two_banks",
+        apart,
+        "a write into the inactive bank changes only that bank",
+        "after a write into the inactive bank, a bank holds something else than it should",
+    )
     why = await t.refusal_of(c.write_bank(now.active_bank, number, first=ID_WORD))
     t.judge("two_banks", bool(why), "the active bank refuses writes", "the active bank accepts writes")
     if not apart:  # restore the number wherever it was written

@@ -24,8 +24,8 @@ from abbe.service.tables.nine_tables import read_base
 
 FLAG = "can_disable"
 NOT_SHOWN = (
-    "that compensation that is off stays off over a restart: this test restarts nothing",
-    "that a late or repeated request to switch does nothing: the driver numbers them",
+    "that a restart leaves switched-off compensation off: this test restarts nothing",
+    "that a late or repeated request to switch does nothing: the driver numbers its requests",
     "lease, interlocks at the instant of a switch, and two banks: this level has none of them",
 )
 

@@ -100,7 +100,8 @@ def scale_note(doc: dict[str, Any], *, without_scale: bool) -> list[str]:
     rest = f"the rest is known to ± {u['without_scale']['expanded_vector_um']:.2g} µm at the worst"
     if without_scale:
         return [f"{text}: left out, and not corrected; {rest}"]
-    return [f"{text}: written, but poorly determined by these runs: ± {worst:.2g} µm with it, {rest}: --without-scale leaves it out"]
+    with_it = f"with it, everything is known to ± {worst:.2g} µm at the worst"
+    return [f"{text}: written, but poorly determined by these runs; {with_it}; {rest}; --without-scale leaves it out"]
 
 
 def reach_note(doc: dict[str, Any]) -> list[str]:

@@ -216,12 +216,12 @@ class _PushQuestions:
     async def probe(self) -> VerificationResult:
         """Probe sign, axis and unit of this table physically; then clear the bar away: the verification mounts its own."""
         if self.bar is None or self.read_before is None:
-            return VerificationResult(True, "no ball-bar reads this table: the sign rests on the commissioning")
+            return VerificationResult(True, "no ball-bar run measured this table: the sign rests on the commissioning")
         after = await self.bar.read("after")
         await self.bar.clear_away()
         each = expected_changes(after.places_mm, np.array(self.bar.centre_mm), self.precheck.base.tables, self.precheck.proposed.tables)
         found = probe(each, self.read_before.deviation_mm, after.deviation_mm)
-        return VerificationResult(found.agrees, found.text + ("" if all(found.observed) else "; that rests on the commissioning"))
+        return VerificationResult(found.agrees, found.text + ("" if all(found.observed) else "; that sign rests on the commissioning"))
 
     async def verify(self) -> VerificationResult:
         context = self.context

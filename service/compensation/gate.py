@@ -83,7 +83,7 @@ class PushPrecheck:
             candidate = _drifted(candidate, drift_mm)
         found = [*self._bound(), *self._rejected(), *reasons_against(candidate, self.context, self.site.limits), *self._approved()]
         if self.proposed.reasons and not found:
-            found = [f"PROPOSED: {len(self.proposed.reasons)} reasons were against it, which no longer hold: propose again"]
+            found = [f"PROPOSED: {len(self.proposed.reasons)} reasons were against the table and no longer hold: propose again"]
         return found
 
     def renewed(self, store: Store, now_s: float) -> PushPrecheck:

@@ -71,17 +71,17 @@ def _pushed(own: Journal, journal: JournalView) -> ProposalStatus | None:
     if last.state is PushState.ROLLED_BACK:
         return ProposalStatus("rolled back", f"by push {last.push} itself: {f.why}")
     if last.state is not PushState.KEEP:
-        open_ = "" if last.state in TERMINAL else "; the next command that uses the machine finishes it"
+        open_ = "" if last.state in TERMINAL else "; the next command that uses the machine finishes the push"
         return ProposalStatus("pushed", f"push {last.push} is in state {last.state}{open_}")
     later = [j for n, j in journal.pushes.items() if n > last.push and j[-1].state is PushState.KEEP]
     if not later:
         return ProposalStatus("kept", f"push {last.push}: {f.verify}")
     if facts(later[-1]).image == f.image:
-        return ProposalStatus("kept", f"push {last.push} kept it; in force again since push {later[-1][-1].push}")
+        return ProposalStatus("kept", f"push {last.push} kept the table; in force again since push {later[-1][-1].push}")
     number = later[0][-1].push
     if journal.origin(later[0]).kind == KIND:
-        return ProposalStatus("rolled back", f"by order of a person with push {number}, after push {last.push} had kept it")
-    return ProposalStatus("superseded", f"push {last.push} kept it; push {number} put another table in its place")
+        return ProposalStatus("rolled back", f"by order of a person with push {number}, after push {last.push} had kept the table")
+    return ProposalStatus("superseded", f"push {last.push} kept the table; push {number} put another table in its place")
 
 
 def valid_approval(

@@ -98,7 +98,7 @@ def _evidence(site: Site, promise: Promise, runs: list[Run]) -> TableEvidence:
     )  # fmt: skip
 
 
-STATED = "the air's temperature is not measured: a person stated that of the room (room_temperature_c)"
+STATED = "the air's temperature is not measured: a person stated the room's temperature (room_temperature_c)"
 
 
 def air_is_stated(site: Site, runs: list[Run]) -> bool:

@@ -228,7 +228,7 @@ class Pushing:
             now = await self.controller.comp_status()
             if now.bank_crc[now.active_bank] == known.crc != known.base_crc:
                 given_up = f"push {ended.journal[-1].push} was given up ({known.why})"
-                why = f"{given_up}, and the control made its table active all the same"
+                why = f"{given_up}, but the control made the table of this push active"
                 raise TableMismatch(f"{why}: {STILL_ACTIVE} (CRC {known.crc:08X})", UNTRUSTED_CONTROL)
 
     def _stop_reason(self) -> str:

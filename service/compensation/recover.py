@@ -174,7 +174,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
     if push is None:
         return text
     name = "" if push.chain == chain and push.machine == site.name else f" of machine {push.machine!r}"
-    return f"{text}; it is that of push {push.push}{name}, which no measurement has verified"
+    return f"{text}; it is the table of push {push.push}{name}, which no measurement has verified"
 
 
 def _open_with(crc: int, known: KnownTables) -> set[str]:
@@ -235,8 +235,8 @@ async def check_own(controller: Identity, site: Site, journal: Journal) -> None:
     at, name = _address(journal) or "an address that the journal does not state", _name(journal, site)
     raise TableMismatch(
         f"push {journal[-1].push} of machine {name!r}, begun at {at}, has not ended, and "
-        f"nothing shows that this control is that of {name!r}",
-        f"finish the push with the machine file of {name!r}; if this control is that of {name!r} and its active table is right: "
+        f"nothing shows that this control belongs to machine {name!r}",
+        f"finish the push with the machine file of {name!r}; if this control belongs to it and its active table is right: "
         "`abbe accept-table -m MACHINE.toml --yes`; nothing was written",
     )
 

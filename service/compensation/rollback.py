@@ -99,7 +99,7 @@ async def rollback(
     if wanted.image == base.image:
         return None
     await check_commissioned(controller, store, site)  # the image was proved on one control: what another one does with it is unknown
-    why = f"not measured: byte for byte {wanted.how}; ordered back by a person"
+    why = f"a person ordered the rollback, nothing was measured: byte for byte {wanted.how}"
 
     def reasons() -> list[str]:
         return [] if wanted.image in known_images(journal) else ["UNKNOWN: by the journal, this table was never in force"]
@@ -222,7 +222,7 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
     except (AbbeError, DriverError, OSError) as error:
         return JobOutcome(STOPPED if control.stopping or control.aborting else "failed", with_notes(error))
     if back is None:
-        return JobOutcome("refused", "the table from before is in force already; nothing was written")
+        return JobOutcome("refused", "the earlier table is in force already; nothing was written")
     text = f"push {back.pushed.push_id}: the table is in force again (CRC {back.pushed.crc:08X}): {back.how}"
     return JobOutcome("kept", f"{text}; the machine is unverified now: run a quick check")
 

@@ -30,13 +30,16 @@ ACTION = "machine file"
 FILE_ONLY = "limits.two_people"
 """Nobody switches this off on the page: the one person who could is the one it keeps from deciding alone."""
 LONGEST_TARGET = 400
-CLOSED = "{key} is different in the file: only a start of the service by its computer takes it over"
+CLOSED = "{key} is different in the file: start the service again on its computer to use the new value"
 
 
 @dataclass(frozen=True, slots=True)
 class FileChangeContext:
-    """What a change needs to know. ``may(who, need)``: rights; ``claim``: claim on the machine, None: no jobs now; ``push_open``: whether a
-    push is unfinished; ``restart``: starts the service anew with a setup; ``cnc``: URL of the controller, None: there is none."""
+    """What a change needs to know.
+
+    ``may(who, need)``: whether a person has a right. ``claim``: claims the machine; None while the service takes no jobs. ``push_open``:
+    whether a push is unfinished. ``restart``: starts the service anew with a setup. ``cnc``: URL of the controller, if there is one.
+    """
 
     may: Callable[[str, Permission], Awaitable[bool]]
     audit: AuditBook
@@ -156,7 +159,7 @@ def _check(asked: ChangeFile, old: LoadedMachine, new: LoadedMachine, found: tup
     if not found and (asked.edits or old.body == new.body):
         raise _Refusal("conflict", "nothing is different from the file in force")
     if any(one.key == FILE_ONLY and one.looser for one in found):
-        raise _Refusal("conflict", f"{FILE_ONLY} is switched off in the file only, by whoever may start the service")
+        raise _Refusal("conflict", f"{FILE_ONLY} can be switched off only in the file, by somebody who may start the service")
     looser = [str(one) for one in found if one.looser]
     if looser and not (asked.looser and asked.reason.strip()):
         raise _Refusal("conflict", f"this allows more than before: {', '.join(looser)}. Tick that you mean it, and give the reason")

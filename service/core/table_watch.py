@@ -145,12 +145,12 @@ class TableWatch:
         """Return the fault of the table in force; empty without a fault."""
         wanted = in_force.wanted if in_force.wanted is not None else self._first
         here = f"bank {in_force.bank} has CRC {in_force.crc:08X}"
-        whose = f"that of {in_force.unverified}, which was never verified" if in_force.unverified else ""
+        whose = f"it is the table of {in_force.unverified}, which was never verified" if in_force.unverified else ""
         if wanted is not None and in_force.crc != wanted:
             text = f"the compensation in force was changed from outside: {here} instead of {wanted:08X}"
-            return f"{text}; it is {whose}" if whose else text
+            return f"{text}; {whose}" if whose else text
         if whose:
-            return f"the compensation in force is unverified: {here}, {whose}"
+            return f"the compensation in force is unverified: {here}; {whose}"
         return f"{STRANGE_TABLE} is in force: {here}" if in_force.strange else ""
 
     async def _judge(self, in_force: InForce) -> None:

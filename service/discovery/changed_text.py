@@ -40,7 +40,7 @@ def changed_lines(changed: ChangedSince | None) -> list[str]:
         if not _sure(c):
             out.append(f"  {name}: zero is within its uncertainty, so another scale or squareness may have changed instead")
     if changed.changes and changed.beside:
-        out.append(f"  {', '.join(changed.beside)} was found in the same runs and may be what looks like a change here")
+        out.append(f"  {', '.join(changed.beside)} was found in the same runs and may look like a change here")
     return out + (_proof(changed) if changed.changes else []) + _hidden(changed)
 
 

@@ -105,7 +105,7 @@ def _left_out_text(finding: Finding) -> str:
     """Tell how far the gap closed on blocks of runs that were left out in turn; empty where holdout runs judge."""
     if finding.left_out is None:
         return ""
-    return f"; on blocks of runs left out of the fit in turn, for names that all readings chose, {_judging_text(finding.left_out)}"
+    return f"; on blocks of runs, each left out of the fit once, with names chosen from all readings, {_judging_text(finding.left_out)}"
 
 
 def _suspect_text(finding: Finding) -> str:

@@ -129,7 +129,7 @@ class Window:
     hours: Annotated[float, Field(ge=0.0, le=744.0, description="how long it lasts, with cron")] = 0.0
     days: Annotated[frozenset[Day], Field(description='instead of cron: days on which it begins, e.g. ["sat", "sun"]')] = frozenset()
     start: Annotated[time | None, Field(description="wall time, with days, e.g. 22:00:00")] = None
-    end: Annotated[time | None, Field(description="wall time; not later than start: on the day after")] = None
+    end: Annotated[time | None, Field(description="wall time; if not later than start, the window ends on the next day")] = None
 
 
 def complete(window: Window) -> Window:

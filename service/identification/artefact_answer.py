@@ -22,7 +22,7 @@ ONE_PLANE_MM = 5.0
 """Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""
 WHOLE_TO, NOTHING_FROM = 0.35, 1.0
 """Ratios of mean squared uncertainty to mean squared deviation: up to the first a map is offered whole, from the second not at all."""
-TILTED = "The artefact lay tilted: which errors its poses hide is not listed, U of the deviation says how much they leave open."
+TILTED = "The artefact lay tilted: Abbe does not list the errors that its poses hide, but U of the deviation includes them."
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
 NO_LENGTH = "; no length is calibrated: the scale is not observable"
 NOT_SENSED = "; the third direction was not sensed"

@@ -42,7 +42,7 @@ from abbe.service.tables.measured_with import images_of
 from abbe.service.tables.nine_tables import tables_from_image
 
 NOTHING = AppliedTables(np.zeros_like)
-NOT_REMOVED = "the effect of tables beyond smooth corrections, above all with lost motion, is still in the readings"
+NOT_REMOVED = "the side effects of tables (beyond smooth corrections, mostly from lost motion) are still in the readings"
 
 
 @dataclass(frozen=True)
@@ -117,7 +117,9 @@ def table_line(removed: TableRemoval) -> str:
     """Return one line about the removed table."""
     lost = ", ".join(f"{axis} {one.value * 1e3:.1f} µm (u {one.u * 1e3:.1f})" for axis, one in removed.lost_motion_mm.items())
     which = "" if removed.crc is None else f" {removed.crc:08X}"
-    return f"table{which} was in force: its effect beyond smooth corrections is subtracted from the readings, with lost motion {lost}"
+    return (
+        f"table{which} was in force: its side effects (beyond smooth corrections) are subtracted from the readings, for lost motion {lost}"
+    )
 
 
 def removed_table(table: NineTables, lost_mm: F1) -> RemovedTable:

@@ -34,7 +34,7 @@ class OperationOrder:
     limits : str
         Digest of the limits that it was checked against.
     owner : int
-        Owner id of the lease, u32. Its low 16 bits are 0; later leases of the same push count in them.
+        Owner id of the lease, u32. Its low 16 bits are 0: they count the later leases of the same push.
     level : int
         Capability level of the controller (`abbe.service.push.journal`).
     attended : bool
@@ -200,7 +200,7 @@ class PushFacts(OperationOrder):
     by: str = ""
 
     def binding(self, expiry: str) -> str:
-        """The digest that an approval until ``expiry`` has to bind (`approval_digest`)."""
+        """The digest that an approval until ``expiry`` must contain (`approval_digest`)."""
         return approval_digest(self.image, base_image=self.base_image, machine=self.machine, limits=self.limits, expiry=expiry)
 
 
@@ -270,7 +270,7 @@ def _parsed(doc: Doc) -> PushFacts:
 
 
 def approval_digest(image: bytes, *, base_image: bytes, machine: str, limits: str, expiry: str) -> str:
-    """SHA-256 that an approval binds: exactly this table on exactly this base, for this machine, under these limits, until ``expiry``.
+    """SHA-256 of what an approval permits: exactly this table on exactly this base, for this machine, under these limits, until ``expiry``.
 
     ``limits``: their digest (`abbe.service.push.validate.PushLimits.digest`).
     """

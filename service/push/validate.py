@@ -66,7 +66,7 @@ class PushLimits:
     beyond: float = 0.25
 
     def digest(self) -> str:
-        """SHA-256 of the limits. An approval binds it, and so does not hold under other limits."""
+        """SHA-256 of the limits. Every approval contains it, so no approval holds under other limits."""
         return hashlib.sha256(canonical(asdict(self))).hexdigest()
 
 
@@ -208,7 +208,7 @@ def _binding(c: Candidate, context: CandidateContext) -> Iterator[str]:
 def _form(c: Candidate, context: CandidateContext) -> Iterator[str]:
     names = [(column.moved, column.corrected) for column in c.columns]
     if sorted(names) != [(a, i) for a in AXES for i in AXES]:
-        yield f"FORM AXES: needs each of X, Y, Z over each of them once, has {len(names)} columns"
+        yield f"FORM AXES: expected one column for each of X, Y, Z over each of X, Y, Z, got {len(names)} columns"
         return
     registers = HEADER_REGISTERS + sum(len(column.correction_mm) for column in c.columns)
     if registers > context.bank_registers:
@@ -258,7 +258,7 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     if not e.calibrated_until_s:
         yield "CERTIFICATE: the instruments have no calibration certificate"
     elif not min(e.calibrated_until_s) >= newest_s:
-        yield "CERTIFICATE: a calibration had expired when it was measured"
+        yield "CERTIFICATE: an instrument's certificate had ended before the measurement"
     yield from _reach(c, context, limits)
 
 

@@ -131,7 +131,7 @@ class Comparison:
 
     @property
     def again_fit(self) -> Fit | None:
-        """Agreement of the number computed with the erratum; None without a computable erratum."""
+        """How the number computed by the erratum agrees with the printed one; None without a computable erratum."""
         return None if self.erratum is None or self.erratum.again is None else fit(self.erratum.again, self.expected)
 
     @property

@@ -102,7 +102,7 @@ def _covariance(path: Path, given: Mapping[str, Any] | None, motions: ErrorMotio
         more = f" and {len(unknown) - 1} more" if len(unknown) > 1 else ""
         return (
             None,
-            f"no uncertainty: the covariance of the errors file names {unknown[0]!r}{more}, not a parameter of its functions",
+            f"no uncertainty: the covariance of the errors file names {unknown[0]!r}{more}, which is not a parameter of its functions",
         )
     return (names, matrix), _covered(names, motions)
 

@@ -76,7 +76,7 @@ def run_clock(chunks: Sequence[ChunkRecord], end: RunEnd, edges: Edges) -> RunCl
     elif found:
         doc["trouble"] = found
     if not tries:
-        return RunClock(1.0, 0.0, doc | {"rate_from": "nothing: taken to be equal"})
+        return RunClock(1.0, 0.0, doc | {"rate_from": "nothing: both clocks are taken to be equal"})
     rate, u, source = min(tries, key=lambda one: one[1])
     doc |= {"box_slower_ppm": (rate - 1.0) * 1e6, "u_box_slower_ppm": u * 1e6, "rate_from": source}
     used = rate if abs(rate - 1.0) > SURE * u else 1.0
@@ -124,7 +124,9 @@ def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc
         edge = ("begins", "ends")[worst]
         later = "earlier" if off[worst] > 0.0 else "later"
         by, u_ms = abs(off[worst]) * 1e3, u[worst] * 1e3
-        doc["trouble"] = f"by stamps and arrivals the path {edge} {by:.0f} ms {later} than by the sync line (u = {u_ms:.0f} ms)"
+        doc["trouble"] = (
+            f"by time stamps and arrival times, the path {edge} {by:.0f} ms {later} than the sync line shows (u = {u_ms:.0f} ms)"
+        )
     return doc
 
 

@@ -209,7 +209,7 @@ class Beside:
             self._block.cancel()
 
     async def ended(self) -> None:
-        """Withdraw our own cancellation after the block, and wait for the tasks."""
+        """End the watch after the block: take back the cancellation that a failed task caused, and wait for the tasks."""
         self._open = False
         if self._cancelled:
             self._block.uncancel()

@@ -354,7 +354,9 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
         case PushState.OPERATOR:
             return JobOutcome(OPEN, f"{operator_needed(journal)}; a person has to look")
         case state if state in BEFORE_ACTIVATION:
-            return JobOutcome(OPEN, f"{name} is in state {state}: {names.old} is in force; the next start closes the journal")
+            return JobOutcome(
+                OPEN, f"{name} is in state {state}: {names.old} is in force; the next command that uses the machine finishes the push"
+            )
     pending = f" ({known.pending})" if known.pending else ""
     return JobOutcome(
         OPEN, f"{name} is in state {last.state}{pending}: an unverified table may be in force; it is rolled back before anything else"

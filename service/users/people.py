@@ -149,8 +149,8 @@ TOKEN = re.compile(r"abbe_([0-9a-f]{12})_([A-Za-z0-9_-]{43})")
 class Principal:
     """The account behind a request, and its permissions.
 
-    ``name``: ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``, as in the audit; ``role`` None: no account; ``by``: what identified the
-    account, ``session``, ``token`` or ``nobody``; ``digest``: SHA-256 of the session's secret.
+    ``name``: ``user:NAME``, ``token:NAME/TOKEN`` or ``anonymous``, as in the audit. ``role``: None without an account. ``by``: what
+    identified the account (``session`` or ``token``), or ``nobody``. ``digest``: SHA-256 of the session's secret.
     """
 
     name: str = "anonymous"

@@ -64,7 +64,9 @@ class _MetricsCollector(Collector):
 
 
 def _of_core(snapshot: Snapshot) -> Iterator[Metric]:
-    devices = GaugeMetricFamily("abbe_device_connected", "1: used or answered last, 0: fault or not used yet", labels=["role"])
+    devices = GaugeMetricFamily(
+        "abbe_device_connected", "1: in use, or answered when last asked; 0: fault, or not used yet", labels=["role"]
+    )
     for device in snapshot.devices:
         devices.add_metric([device.role], float(device.state in {"in use", "answered"}))
     yield devices

@@ -197,7 +197,7 @@ class NewJob(RequestBody):
 
     recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
     rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
-    alarm: Annotated[int, Field(ge=0, le=LARGEST, description="A full campaign looks for the cause of this alarm; 0: of none")] = 0
+    alarm: Annotated[int, Field(ge=0, le=LARGEST, description="A full campaign looks for the cause of this alarm; 0: of no alarm")] = 0
     resume: Annotated[
         str,
         Field(

@@ -78,7 +78,7 @@ async def test_a_control_with_another_convention_is_named_and_no_table_is_writte
 async def test_another_unit_stops_at_the_first_step(place, monkeypatch):
     b, store = place
     takes(monkeypatch, 25.4 * np.eye(3))
-    with pytest.raises(TableRefused, match="takes the values of its tables for another unit"):
+    with pytest.raises(TableRefused, match="reads the values of its tables in another unit"):
         await commission(b.session, store, b.site, progress=ignore_progress)
     comp = b.sim.world.controller.comp
     assert store.pushes.entries(b.site.name)[-1].state is PushState.ROLLED_BACK

@@ -221,7 +221,7 @@ async def test_never_proved_is_for_attended_pushes_only_and_says_so(place):
             OneBank,
             {"two_banks", "generation", "lease", "swap_compares", "interlocks"},
             0,
-            "a write does not change the inactive bank alone",
+            "after a write into the inactive bank, a bank holds something else than it should",
         ),
         (OpenBank, {"two_banks"}, 0, "the active bank accepts writes"),
         (NeverSeals, {"two_banks", "swap_compares", "interlocks"}, 0, "cannot be made ready"),

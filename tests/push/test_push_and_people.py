@@ -118,7 +118,7 @@ async def test_a_control_that_refuses_an_activation_and_does_it_later_is_found(m
         assert await recover(b.session.controller, store, b.site) is None
         assert b.site.name in store.machines.names()  # as it is described now, also where nothing was pushed
         return
-    with pytest.raises(TableMismatch, match=r"made its table active all the same.*STILL ACTIVE"):
+    with pytest.raises(TableMismatch, match=r"made the table of this push active.*STILL ACTIVE"):
         await brought(b, store, Waiting(), questions)
     with pytest.raises(TableMismatch, match="never verified"):  # and every later command refuses it
         await recover(b.session.controller, store, b.site)

@@ -272,7 +272,7 @@ def as_it_was(folder: Path) -> str:
     return f"sqlite:///{fresh}"
 
 
-NOT_HERE = r"push 1 of machine 'sim', begun at {}, has not ended, and nothing shows that this control is that of 'sim'"
+NOT_HERE = r"push 1 of machine 'sim', begun at {}, has not ended, and nothing shows that this control belongs to machine 'sim'"
 
 
 async def test_a_control_of_the_same_name_at_another_address_does_not_end_the_open_push(tmp_path: Path) -> None:

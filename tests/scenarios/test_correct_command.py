@@ -175,7 +175,7 @@ def test_another_name_at_another_address_is_refused_and_told_whose_table_it_is_u
         refused(command(*words), "CMP-002", f"(CRC {killed.crc}) is that of push 1 of machine 'sim'", "never verified", "accept-table")
     assert (position_and_counters(killed.sims), table(killed.sims)) == (still, killed.after)
     out, _ = done(command("accept-table", "-m", machine, "--yes", "--json"))
-    assert "it is that of push 1 of machine 'sim', which no measurement has verified" in out
+    assert "it is the table of push 1 of machine 'sim', which no measurement has verified" in out
     old = tmp_path / "old.toml"  # under the old name it is closed, too: an accepted table is not taken back
     old.write_text(Path(machine).read_text().replace("mill-A", "sim").replace("localhost", "127.0.0.1"))
     done(command("measure", "-m", old, *HELIX))

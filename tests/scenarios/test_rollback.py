@@ -51,7 +51,10 @@ async def test_back_byte_for_byte_and_forward_again_and_to_the_beginning(start_s
         of_it = {e.state: e.doc for e in entries if e.push == 2}
         assert of_it[PushState.APPROVED]["approved_by"].endswith("rollback")
         for state, key in ((PushState.PROBED, "probe"), (PushState.VERIFIED, "verify")):
-            assert of_it[state][key] == "not measured: byte for byte the table that was in force before push 1; ordered back by a person"
+            assert (
+                of_it[state][key]
+                == "a person ordered the rollback, nothing was measured: byte for byte the table that was in force before push 1"
+            )
         assert PushState.STAGED in of_it  # read back, twice, like any other
         with pytest.raises(TableRefused, match="was itself a rollback"):
             await rollback(c, store, site)

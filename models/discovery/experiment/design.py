@@ -97,7 +97,8 @@ def propose(
     Returns
     -------
     NextTest or None
-        None without rivals, or if every addition gains less than `LEAST` sigmas. If every addition gains less than `WORTH`, the best one.
+        None without rivals, or if every addition gains less than `LEAST` sigmas. If every addition gains less than `WORTH`, the result is
+        the best one.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:

@@ -170,9 +170,10 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Roughness:
-    """Stick-slip of one axis, found by a gate (weights of readings that fall with its speed; ``weight``: their square roots by run).
+    """Stick-slip of one axis, found by a gate: a weight for each reading that falls as the axis moves faster.
 
     ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: gate speed, mm/s. ``size_mm``: half height of a saw-tooth.
+    ``weight``: square root of the weights, by run.
     """
 
     gain: float

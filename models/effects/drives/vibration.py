@@ -16,9 +16,10 @@ def swinging(path: Path, key: str, values: Values) -> F2:
 
 
 def line(paths: tuple[Path, ...], key: str, f_hz: float) -> list[F2]:
-    """Return sine and cosine columns of one frequency along the axis, 1 um, separate for every ball-bar run, whose phases are unknown.
+    """Return sine and cosine columns of one frequency along the axis, amplitude 1 um, shape (n, 2 runs) for each path.
 
-    A search over frequencies uses these columns as the mean signal of a steady vibration: shape (n, 2 runs) per path, runs by label.
+    Every ball-bar run has a pair of columns of its own, in the order of the labels, because its phase is unknown. A search over
+    frequencies uses these columns as the mean signal of a steady vibration.
     """
     a, place = axis_of(key), order_of(path.label for path in paths if path.kind == "bar")
     out = []

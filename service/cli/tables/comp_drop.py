@@ -25,8 +25,10 @@ def drop(  # noqa: PLR0913 - one argument for each option
         Path | None,
         typer.Option("--back", metavar="PATH", help="Files that the control wrote of its tables: confirms the drop.", show_default=False),
     ] = None,
-    seen: Annotated[bool, typer.Option("--seen", help="I have seen at the control that the tables are loaded: recorded as said.")] = False,
-    take_back: Annotated[bool, typer.Option("--take-back", help="Put the files from before into the folder again.")] = False,
+    seen: Annotated[
+        bool, typer.Option("--seen", help="I have seen at the control that the tables are loaded: recorded as your statement.")
+    ] = False,
+    take_back: Annotated[bool, typer.Option("--take-back", help="Put the earlier files back into the folder.")] = False,
     reference: ReferenceOption = None,
     step_moved: StepOption = None,
     machine: MachineOption = None,

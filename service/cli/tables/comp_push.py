@@ -69,7 +69,12 @@ def push(
 def rollback(
     to: Annotated[
         int | None,
-        typer.Option("--to", metavar="PUSH", help="To the table in force after this push; 0: before the first.", show_default=False),
+        typer.Option(
+            "--to",
+            metavar="PUSH",
+            help="Go back to the table that was in force after this push; 0: before the first push.",
+            show_default=False,
+        ),
     ] = None,
     yes: Annotated[bool, typer.Option("--yes", help="Do not ask: I know that the machine is unverified afterwards.")] = False,
     machine: MachineOption = None,

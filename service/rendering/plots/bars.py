@@ -136,7 +136,7 @@ def share_plot(
     svg.text((10.0, 18.0), heading, "t-head")
     svg.text((10.0, 38.0), count, "t-soft")
     panel = Panel(labels, top, width - labels - texts, height, (0.0, 100.0), (0.0, 1.0))
-    panel.draw_x(svg, "share of what is known, from readings, in %", count=5)
+    panel.draw_x(svg, "share of the information that comes from readings, in %", count=5)
     for i, row in enumerate(rows):
         y = top + row_height * (i + 0.5)
         svg.text((labels - 8.0, y + 4.0), row.name, anchor="end")

@@ -119,7 +119,7 @@ class People(Repository):
         def work(connection: Connection) -> int:
             same = (api_tokens.c.user_id == token.user_id) & (api_tokens.c.name == token.name)
             if connection.execute(select(api_tokens.c.id).where(same)).first() is not None:
-                raise StoreError(f"this user has a token {token.name!r} already", "give another name; a revoked token keeps its own")
+                raise StoreError(f"this user has a token {token.name!r} already", "give another name; a revoked token keeps its name")
             return insert_row(connection, api_tokens, **TOKEN.values(token, "id", "created_utc"), created_utc=self._db.now())
 
         return self._db.commit(work)

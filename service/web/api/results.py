@@ -32,7 +32,9 @@ Motion = Literal[
     "EXX", "EYX", "EZX", "EAX", "EBX", "ECX", "EXY", "EYY", "EZY", "EAY", "EBY", "ECY",
     "EXZ", "EYZ", "EZZ", "EAZ", "EBZ", "ECZ", "C0Y", "B0Z", "A0Z",
 ]  # fmt: skip
-Motions = Annotated[list[Motion], Query(max_length=21, description="The map shows the joint effect of these; none: of all.")]
+Motions = Annotated[
+    list[Motion], Query(max_length=21, description="The map shows the joint effect of these motions; none: of all motions.")
+]
 
 
 def _no_number(value: object) -> object:

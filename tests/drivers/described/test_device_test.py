@@ -112,5 +112,5 @@ async def test_what_is_wrong_is_named(
     assert found[0] == CheckVerdict.FAILED
     assert why in found[1]
     assert report.abilities == ()
-    with pytest.raises(NotProved, match="its test did not prove it"):
+    with pytest.raises(NotProved, match="its device test did not prove this"):
         await open_laser(f"{wrong}&tested={kept(report, tmp_path)}")

@@ -81,7 +81,8 @@ def test_what_two_related_names_share_belongs_to_the_stronger_one() -> None:
     told = residues(pair, SCATTER, without)
     assert ties(pair, SCATTER, without) == frozenset()
     assert told == {
-        "laser_cosine": "evidence 3, only 1.4% of that of air_refraction: possibly only the deviation of air_refraction from its formula"
+        "laser_cosine": "evidence 3, only 1.4% of the evidence of air_refraction: "
+        "possibly only the deviation of air_refraction from its formula"
     }
 
 

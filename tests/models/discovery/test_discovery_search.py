@@ -195,7 +195,7 @@ def test_a_lone_name_that_leans_on_one_residue_is_told_with_that_residue() -> No
     leans = Selection(lead, gain=beside, score=beside - cost)
     found = [leans, Selection(other, 500.0, 450.0), Selection(idle, 60.0, 10.0)]
     told = leaning(problem, found, {other.label, idle.label, "vibration:X"})
-    assert told == {lead.label: f"evidence {leans.score / 2.0:.0f}, but none without {other.label}, not named either"}
+    assert told == {lead.label: f"evidence {leans.score / 2.0:.0f}, but none without the rejected {other.label}"}
     assert leaning(problem, found, {idle.label}) == {}
     assert leaning(problem, [leans], {"vibration:X"}) == {}  # a variance effect is in no fit
 
@@ -271,7 +271,7 @@ def test_nothing_stands_beside_a_lone_name_or_an_unknown() -> None:
     unknown = discover(campaign(backlash_um=0.8, step_um=6.0), CATALOGUE)
     assert unknown.verdict == "unknown"
     assert unknown.effects == unknown.beside == ()
-    assert "less than that of the structures without a name" in dict(unknown.rejected)["backlash:X"]
+    assert "less than the structures without a name have" in dict(unknown.rejected)["backlash:X"]
 
 
 def test_a_role_whose_readings_are_all_flagged_has_no_gap() -> None:
@@ -315,5 +315,5 @@ def test_without_a_run_that_judges_the_gap_is_told_on_left_out_blocks_and_such_a
     assert found.next_test is not None
     assert found.next_test.adds == ("judging_run",)
     told = lines_of(finding_of(found, alone, FEW, {r.path.label: np.zeros(r.path.n) for r in alone.runs}))
-    assert "no holdout run of this campaign can judge; on blocks of runs left out of the fit in turn" in told[0]
+    assert "no holdout run of this campaign can judge; on blocks of runs, each left out of the fit once" in told[0]
     assert any("measure next: a run of the role holdout" in line for line in told)

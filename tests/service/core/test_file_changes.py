@@ -202,7 +202,7 @@ async def test_a_second_person_is_kept_on_the_page_and_asked_for_on_it(bench: Be
     bench.loaded = load_machine(bench.file)
     for value in ("false", "null"):
         answer = await bench.ask(FileEdit("limits.two_people", value), looser=True, reason="she is on holiday")
-        assert (answer.outcome, "switched off in the file only" in answer.text) == ("conflict", True)
+        assert (answer.outcome, "switched off only in the file" in answer.text) == ("conflict", True)
     assert bench.begun == []
     bench.file.write_text(TEXT)
     bench.loaded = load_machine(bench.file)

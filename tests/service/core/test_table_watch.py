@@ -118,12 +118,13 @@ async def test_without_a_push_a_control_as_it_comes_is_what_counts() -> None:
         (InForce(1, 0xC, 0xC, strange=True), "a table that this database did not push is in force: bank 1 has CRC 0000000C"),
         (
             InForce(1, 0xC, None, unverified="push 2 of machine 'mill'"),
-            "the compensation in force is unverified: bank 1 has CRC 0000000C, that of push 2 of machine 'mill', which was never verified",
+            "the compensation in force is unverified: bank 1 has CRC 0000000C; it is the table of push 2 of machine 'mill', which was "
+            "never verified",
         ),
-        (InForce(1, 0xC, 0xC, unverified="push 2 of machine 'mill'"), "unverified: bank 1 has CRC 0000000C, that of push 2"),
+        (InForce(1, 0xC, 0xC, unverified="push 2 of machine 'mill'"), "unverified: bank 1 has CRC 0000000C; it is the table of push 2"),
         (
             InForce(1, 0xC, 0xA, unverified="push 2 of machine 'mill'"),
-            "instead of 0000000A; it is that of push 2 of",
+            "instead of 0000000A; it is the table of push 2 of",
         ),
     ],
 )

@@ -161,7 +161,7 @@ def test_every_command_takes_the_table_out_that_the_database_knows(
     x = told.lost_motion_mm["X"]
     assert abs(x.value - WIDTH_MM) < 4.0 * x.u + 1e-3
     assert cli.run(["solve", "july", "--db", DB, "--model", "rigid6"]) == 0
-    assert f"table {crc32(image):08X} was in force: its effect beyond smooth corrections is subtracted" in " ".join(
+    assert f"table {crc32(image):08X} was in force: its side effects (beyond smooth corrections) are subtracted" in " ".join(
         capsys.readouterr().out.split()
     )
 

@@ -95,7 +95,7 @@ def test_every_reading_is_where_the_machine_was_although_the_boxs_clock_drifts(d
     assert timing["u_sync_ms"] < 5.0
 
 
-@pytest.mark.parametrize(("late_s", "says"), [(0.05, "earlier than by the sync line"), (-0.05, "later than by the sync line")])
+@pytest.mark.parametrize(("late_s", "says"), [(0.05, "earlier than the sync line shows"), (-0.05, "later than the sync line shows")])
 def test_a_sync_line_that_is_late_is_held_against_the_arrivals_and_said(late_s, says):
     run = measured(drift_ppm=100.0, sync_late_s=late_s)
     assert says in run["timing"]["trouble"]

@@ -241,7 +241,7 @@ def test_a_covariance_of_other_parameters_is_not_used_and_that_is_said(bench: Be
     bench.errors = bench.write("e.json", ERRORS | {"covariance": {"parameters": ["C0Y", strange], "matrix": [[1e-12, 0], [0, 1e-12]]}})
     doc = bench.doc()
     assert doc["uncertainty"]["given"] is False
-    assert f"names {strange!r}, not a parameter of its functions" in doc["uncertainty"]["text"]
+    assert f"names {strange!r}, which is not a parameter of its functions" in doc["uncertainty"]["text"]
     assert doc["points"][0]["u_norm_mm"] is None
 
 

@@ -180,8 +180,8 @@ REFUSALS = (
     "this service was started without a machine file",
     "verify.helix_rms_um: expected greater than 0, got -3",
     "the machine is in use: machine file",
-    "alarm.push is different in the file: only a start of the service by its computer takes it over",
-    "limits.two_people is switched off in the file only, by whoever may start the service",
+    "alarm.push is different in the file: start the service again on its computer to use the new value",
+    "limits.two_people can be switched off only in the file, by somebody who may start the service",
     "calibration.laser: expected a day such as 2027-05-31, got '2027-02-30'",
 )
 
