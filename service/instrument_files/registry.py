@@ -10,7 +10,7 @@ import numpy as np
 from abbe.service.domain.imported_file import SourceFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.ballbar import read_b5r
-from abbe.service.instrument_files.columns import ColumnFile, read_table, table_of
+from abbe.service.instrument_files.columns import ColumnFile, guesses, read_table, table_of
 from abbe.service.instrument_files.content import AxisReadings, Content, read_bytes
 from abbe.service.instrument_files.dynamic import read_rtx
 from abbe.service.instrument_files.mean_tables import read_pos, read_ren
@@ -26,7 +26,8 @@ READERS: Mapping[str, Callable[[str, bytes], Content]] = {
     ".b5r": read_b5r,
 }
 """Reader of each ending (in small letters); it gets a file's name and bytes."""
-TABLES = (".csv", ".tsv", ".txt", ".xlsx", ".xlsm")
+WORKBOOKS = (".xlsx", ".xlsm")
+TABLES = (".csv", ".tsv", ".txt", *WORKBOOKS)
 """Endings of tables, which need a column file."""
 
 
@@ -67,6 +68,31 @@ def headings_of(path: Path, heading: int) -> list[str]:
         The file is no table.
     """
     return table_of(path.name, read_bytes(path), heading).headings(heading)
+
+
+FIRST_ROWS = 40
+
+
+def likely_heading(path: Path) -> int:
+    """Row that looks most like headings: of the first forty, the one with the most columns of known meaning; 1 if none has two.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be read.
+    """
+    raw, most, found = read_bytes(path), 1, 1
+    book = table_of(path.name, raw, 1) if path.suffix.lower() in WORKBOOKS else None
+    first = b"\n".join(raw.splitlines()[:FIRST_ROWS])
+    for row in range(1, FIRST_ROWS + 1):
+        try:
+            names = (book or table_of(path.name, first, row)).headings(row)
+        except FileFormatError:
+            continue
+        known = len({name for _, name in guesses(names)})
+        if known > most:
+            most, found = known, row
+    return found
 
 
 UM = 1e3

@@ -182,9 +182,9 @@ def _columns_asked(path: Path) -> ColumnFile:
     """Ask for heading, axis, columns and units of a table."""
     from abbe.service.instrument_files.answers import ANGLES, LENGTHS
     from abbe.service.instrument_files.columns import TIMES, ColumnFile, guesses, has_decimal_commas
-    from abbe.service.instrument_files.registry import headings_of
+    from abbe.service.instrument_files.registry import headings_of, likely_heading
 
-    heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=1, err=True)
+    heading = typer.prompt(f"{path.name}: row of the headings (0: none)", type=int, default=likely_heading(path), err=True)
     names = headings_of(path, heading)
     guess = dict(guesses(names))
 

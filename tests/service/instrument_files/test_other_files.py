@@ -13,7 +13,7 @@ from abbe.service.instrument_files.answers import Answers, open_questions, settl
 from abbe.service.instrument_files.campaign import campaign_of
 from abbe.service.instrument_files.columns import column_file, toml_of
 from abbe.service.instrument_files.content import Content
-from abbe.service.instrument_files.registry import read_file
+from abbe.service.instrument_files.registry import likely_heading, read_file
 from tests.service.instrument_files.examples import B5R, COLUMNS, POS, REN, TABLE, rtx
 
 
@@ -268,3 +268,16 @@ def test_a_column_file_comes_back_as_it_was(folder: Folder) -> None:
     found = column_file(folder.path / "c.toml")
     (folder.path / "d.toml").write_text(toml_of(found))
     assert column_file(folder.path / "d.toml") == found
+
+
+@pytest.mark.parametrize(
+    ("text", "row"),
+    [
+        ("Target (mm);Error (um)\n0;0.1\n100;0.4\n", 1),
+        ("Position error test, hall 3\nAir 20.1\n\nTarget (mm),Error (um)\n0,0.1\n", 4),
+        ("0 0.1\n100 0.4\n", 1),
+    ],
+)
+def test_the_row_of_the_headings_is_proposed_below_a_preamble(folder: Folder, text: str, row: int) -> None:
+    (folder.path / "t.csv").write_text(text)
+    assert likely_heading(folder.path / "t.csv") == row
