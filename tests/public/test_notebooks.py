@@ -57,5 +57,5 @@ def test_the_planned_recipe_is_written_as_the_notebook_says(tmp_path: Path) -> N
     lines = [*made, "plan.save('f.toml')", "print(plan, plan.plot().svg[:4])"]
     ran = subprocess.run([sys.executable, "-c", "\n".join(lines)], cwd=tmp_path, capture_output=True, text=True, check=False)
     assert ran.returncode == 0, ran.stderr
-    assert re.fullmatch(r"<abbe.Plan: \d+ measurements, \d min, U = .* µm> <svg\n", ran.stdout)
+    assert re.fullmatch(r"( *\d+% [^\n]*\n)+<abbe.Plan: \d+ measurements, \d min, U = .* µm> <svg\n", ran.stdout)
     assert read_recipe(tmp_path / "f.toml")[1]
