@@ -12,8 +12,9 @@ from itertools import permutations
 import numpy as np
 
 from abbe.models.arrays import F1, F2
+from abbe.service.domain.artefact import Feature
 from abbe.service.domain.document import Doc
-from abbe.service.domain.run import BarSetup, LaserSetup, Run
+from abbe.service.domain.run import FEATURE, ArtefactSetup, BarSetup, Columns, LaserSetup, Run
 
 Distance = Callable[[F2], float]
 
@@ -43,6 +44,8 @@ def geometry_mistake(machine: Doc, run: Run) -> GeometryMistake | None:
         found = _bar(run.test, setup, points)
     elif isinstance(setup, LaserSetup):
         found = _laser(run.test, setup, points)
+    elif setup.by_machine and setup.features is not None:
+        found = _artefact(setup, {f.id: f for f in setup.features.features}, run.columns)
     return found or _inside(machine, points)
 
 
@@ -83,6 +86,20 @@ def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> GeometryMi
                 name = "centre_mm and radius_mm hold" if key == "both" else f"{key} holds"
                 return GeometryMistake(f"{place}: {name} {unit}", "convert to mm")
     return None
+
+
+def _artefact(setup: ArtefactSetup, known: dict[str, Feature], columns: Columns) -> GeometryMistake | None:
+    """Compare the deviation of each probed point with its position, pose and nominal place; walls are read at the stylus' radius."""
+    names = [str(name) for name in columns.further[FEATURE]]
+    read = np.column_stack([columns.further.get(f"deviation_{a}_mm", np.full(len(names), np.nan)) for a in AXES]).astype(np.float64)
+    nominal = np.array([known[name].nominal_mm if known[name].normal is None else [np.nan] * 3 for name in names])
+    own = (columns.q_mm - setup.pose.origin_mm) @ setup.pose.matrix - nominal
+    away = np.nan_to_num(np.abs(own - read)).max(axis=1) * columns.valid
+    worst = int(np.argmax(away))
+    if away[worst] <= TOLERANCE_MM:
+        return None
+    place = f"feature {names[worst]}: position and pose put it {away[worst]:.0f} mm from where its deviation does"
+    return GeometryMistake(place, "correct its label, the pose, or deviation_x_mm, deviation_y_mm, deviation_z_mm")
 
 
 def _laser(test: str, setup: LaserSetup, points: F2) -> GeometryMistake | None:

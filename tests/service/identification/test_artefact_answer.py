@@ -11,7 +11,8 @@ import pytest
 from typer.testing import CliRunner
 
 from abbe.service.cli.app import app
-from tests.artefact_campaign import campaign, error_mm
+from abbe.service.errors import CampaignRefused
+from tests.artefact_campaign import PITCH_MM, campaign, error_mm
 
 GRID = np.array([[x, y] for x in np.linspace(300.0, 500.0, 5) for y in np.linspace(140.0, 340.0, 5)])
 
@@ -67,15 +68,32 @@ def _spoil(folder: Path, fault: str) -> None:
     c = run["columns"]
     if fault == "false trigger":
         c["deviation_x_mm"][7] += 0.12
+    elif fault == "exchanged":
+        c["feature"][7], c["feature"][9] = c["feature"][9], c["feature"][7]
+        for k, off in ((7, -2.0 * PITCH_MM), (9, 2.0 * PITCH_MM)):
+            c["deviation_x_mm"][k] += off
     else:
         c["deviation_x_mm"] = [d + 0.012 * (i >= 12) for i, d in enumerate(c["deviation_x_mm"])]
     path.write_text(json.dumps(run))
+
+
+def test_a_label_that_contradicts_the_position_of_its_point_is_refused(tmp_path: Path) -> None:
+    """Labels were exchanged, but not the deviations: as read, both features would keep a wrong form in silence."""
+    folder = campaign(tmp_path)
+    path = folder / "p2.json"
+    run = json.loads(path.read_text())
+    names = run["columns"]["feature"]
+    names[7], names[9] = names[9], names[7]
+    path.write_text(json.dumps(run))
+    with pytest.raises(CampaignRefused, match="run p2: feature E2: position and pose put it 111 mm from where its deviation does"):
+        CliRunner().invoke(app, ["solve", str(folder)], catch_exceptions=False)
 
 
 @pytest.mark.parametrize(
     ("fault", "words"),
     [
         ("false trigger", "run p2: a false trigger at C2: the reading is off by 120 µm - left out"),
+        ("exchanged", "run p2: the labels of features C2 and E2 are exchanged - exchanged back"),
         ("moved", "run p2: the artefact moved before point 13"),
         ("rotated", "run p2: the artefact lay rotated by 90 degrees"),
     ],
