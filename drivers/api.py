@@ -359,7 +359,7 @@ def only_listens(controller: Identity | Motion) -> bool:
 
 
 def resolution_mm(meter: DisplacementMeter) -> float:
-    """Smallest step of a meter's readings, mm: that of its device file, else that of docs/protocols/laser.md."""
+    """Smallest step of a meter's readings, mm: as in its device file, else as in docs/protocols/laser.md."""
     return float(getattr(meter, "resolution_mm", 1e-7))
 
 

@@ -99,7 +99,7 @@ class Box:
             )
 
     def check_can(self, rate_hz: int, range_mm: float) -> None:
-        """Raise ``Refused`` if rate or stroke exceed those of the box, as far as it reports them."""
+        """Raise ``Refused`` if the box cannot have this rate or stroke, as far as it reports its limits."""
         if 0 < self._max_rate_hz < rate_hz:
             detail = f"{rate_hz} Hz requested, but the box sends at most {self._max_rate_hz} Hz"
             raise Refused(self._name, "check", detail, "choose a lower rate")
@@ -130,8 +130,8 @@ class Box:
 class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
-    The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else that of the
-    first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer behind the reading thread, s at 1000 samples/s.
+    The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else the one of
+    the first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer behind the reading thread, s at 1000 Hz.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:

@@ -31,7 +31,7 @@ UNKNOWN: Point = (float("nan"), float("nan"), float("nan"))
 
 
 class ListenedControl:
-    """A control behind a device file. Without one (``source`` is None) its position is unknown. Its clock is that of this computer."""
+    """A control behind a device file. Without one (``source`` is None) its position is unknown. Its clock is this computer's."""
 
     only_listens = True
 
@@ -42,7 +42,7 @@ class ListenedControl:
         self._counted: tuple[float | None, float] = (None, 0.0)
 
     async def identify(self) -> DeviceInfo:
-        """Identify the device; errors as those of its wire."""
+        """Identify the device; errors as for its wire."""
         if self.source is None:
             return DeviceInfo("cnc", "not connected", "", 0, "")
         return await self.source.identify()

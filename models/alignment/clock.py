@@ -167,7 +167,7 @@ class ClockFit:
 
     @property
     def drift_ppm(self) -> float:
-        """Rate of the device's clock minus that of the host's clock, ppm."""
+        """Rate of the device's clock minus the rate of the host's clock, ppm."""
         return (1.0 / self.rate - 1.0) * 1e6
 
     @property

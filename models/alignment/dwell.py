@@ -31,7 +31,7 @@ I1 = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 
 @dataclass(frozen=True, slots=True)
 class Match:
-    """An assignment: ``pairs`` maps the index of a place to that of its standstill; ``cost`` is minus the logarithm of its probability.
+    """An assignment: ``pairs`` maps the index of a place to the index of its standstill; ``cost``: minus the logarithm of its probability.
 
     ``rival``: a standstill and two places to which it may belong, if another assignment is equally good.
     """

@@ -67,7 +67,7 @@ def fit_operator(nodes_mm: F1) -> F2:
     """Return the matrix from values at `fit_positions` to node values of the least-squares polyline, shape (nodes, samples).
 
     A polyline through points of a curve lies on one side of the curve, h^2 f''/8 off in the middle of a cell of length h. The least-squares
-    polyline crosses the curve and leaves about 0.4 times that rms for a parabola (0.6 times for distances in a volume).
+    polyline crosses the curve and leaves about 0.4 times this rms error for a parabola (0.6 times for distances in a volume).
     """
     x = fit_positions(nodes_mm)
     index, share = cells(nodes_mm, x)

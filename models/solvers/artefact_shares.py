@@ -1,8 +1,8 @@
 """Split of the named error fields of a plane into errors of an artefact and errors of the machine, with U and evidence.
 
 The form of the artefact and the map of the machine are unknowns of one solution, and only the poses separate them. If the poses hide a
-field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors. So is that of a field
-which is certain in the reading, but neither in the part nor in the machine.
+field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors. So is the split of a
+field which is certain in the reading, but neither in the part nor in the machine.
 
 Evidence: log of the Savage-Dickey ratio of a normal prior and posterior at zero, nats (Dickey 1971).
 """

@@ -141,7 +141,7 @@ def observability(
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Standard uncertainty of one raw reading, mm, and the least one of an averaged value.
     known : Knowledge, optional
-        Knowledge of the set-up for the rank; default `stated_knowledge`: that stated by the runs themselves.
+        Knowledge of the set-up for the rank; default `stated_knowledge`: what the runs themselves state.
 
     Raises
     ------
@@ -191,7 +191,7 @@ class MapAgainstPrior:
 
     @property
     def carried(self) -> bool:
-        """Whether the readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times that."""
+        """Whether readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times this rms."""
         return self.u_mm <= self.prior_mm and self.predicted_mm <= LARGEST_MAP * self.prior_mm
 
 

@@ -115,7 +115,7 @@ def hidden_combination(a: F2, setup: F2, support: list[int]) -> tuple[F1, float]
     weights : array, shape (len(support),)
         In units of the parameters, largest magnitude 1 and positive.
     trace : float
-        Size of the combination's effect on the readings, relative to that of its parts without cancellation: 0 for a null vector.
+        Size of the combination's effect on the readings, relative to the effect of its parts without cancellation: 0 for a null vector.
     """
     b = project_out(a[:, support], setup)
     size = np.where(np.linalg.norm(b, axis=0) > 0, np.linalg.norm(b, axis=0), 1.0)

@@ -268,7 +268,7 @@ def _solved(whole: InformationSums, sizes: SizeModel, c: Components) -> tuple[Co
 
 
 def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) -> InformationSums:
-    """Normal equations of some readings of the converged solution, to be subtracted from those of all (`InformationSums.minus`)."""
+    """Normal equations of some readings of the converged solution, to be subtracted from the equations of all (`InformationSums.minus`)."""
     r = problem.readings
     a, kind, weight = r.a[rows], r.kind[rows], fit.weight[rows] / fit.decimation[r.kind[rows]]
     y = fit.residual_mm[rows] / problem.sigma[rows] + a @ (fit.theta / problem.sizes.typical)

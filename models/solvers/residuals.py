@@ -66,7 +66,7 @@ def _of_run(run: RunData, z: F1, use: np.ndarray[tuple[int, ...], np.dtype[np.bo
 def _size(label: str, z: F1) -> ResidualTest:
     chi2 = float(z @ z)
     p = float(scipy.special.gammaincc(0.5 * z.size, 0.5 * chi2))
-    text = f"{label}: residuals are {np.sqrt(chi2 / z.size):.1f} times as large as those of the other runs of this instrument"
+    text = f"{label}: residuals are {np.sqrt(chi2 / z.size):.1f} times as large as in the other runs of this instrument"
     return ResidualTest(label, "size", chi2, p, p, False, text)
 
 
@@ -134,7 +134,7 @@ def _holm(tests: list[ResidualTest]) -> tuple[ResidualTest, ...]:
 
 
 def inflation(z: tuple[F1, ...]) -> float:
-    """Ratio of the number of readings to that of independent ones: 1 + 2 sum of the autocorrelation, at least 1.
+    """Ratio of the number of readings to the number of independent readings: 1 + 2 sum of the autocorrelation, at least 1.
 
     The sum ends before the first lag whose autocorrelation is within the noise. ``z``: whitened residuals of one instrument, an array per
     run.

@@ -1,7 +1,7 @@
 """Roughness of a machine: the size of each motion's rough part, and periods such as the lead of a screw.
 
 Periods are searched in the residuals of a solution, one translational motion at a time. A period is claimed only if its gain is far above
-that which the best of as many periods reaches by chance, and if no other period explains the readings about as well (readings at steps
+the gain that the best of as many periods reaches by chance, and if no other period explains the readings about as well (readings at steps
 of one length cannot distinguish a period from its aliases).
 """
 

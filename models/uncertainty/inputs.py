@@ -37,7 +37,8 @@ class StatedInputs:
     repeatability_dof : float
         Degrees of freedom of ``repeatability_mm``; inf if it is stated.
     single_approach : bool
-        False (default): the predicted deviation is the mean of many approaches. True: that of one approach, with its repeatability on top.
+        False (default): the predicted deviation is the mean of many approaches. True: it is the deviation of one
+        approach, with its repeatability on top.
     orders_above : int
         Number of Legendre orders above those of the solution that the machine's errors may contain; 0: none.
 

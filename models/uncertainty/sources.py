@@ -246,7 +246,7 @@ SOURCE_TEXTS = {
     "setup": "set-up: cup, mirror, zero, drift, pose, form of the artefact, where the data leave them open",
     "scale_temperature": "temperature of the scales (assumed)",
     "model_order": "error motions of orders above the chosen one",
-    "table": "a table in force of which nothing is known (assumed of usual size)",
+    "table": "an unknown table that was in force (assumed of usual size)",
     "prior": "typical size of errors, where the data leave them open (assumed)",
     "estimated_sizes": "noise and typical sizes are themselves estimated",
 }

@@ -4,7 +4,7 @@ A correction removes the estimate, not the truth: the uncertainty stays in the m
 correction c made from it, theta - c is normal about t - c with the whole covariance of the solution. Every figure comes from draws of theta
 (GUM Supplement 1), because the largest error, the range along a diagonal and the rms are not linear, and near zero their linear
 uncertainty is wrong. Before and after use the same draws, so their difference has its own uncertainty. A figure that cannot be negative is
-on average larger than that of the mean map, because the unknown part adds to it.
+on average larger than the figure of the mean map, because the unknown part adds to it.
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ def _overlaps(runs: Sequence[Run]) -> list[CampaignIssue]:
         worst = max(meets, key=lambda k: len(meets[k]))
         others = meets.pop(worst)
         meets = {k: [m for m in v if m != worst] for k, v in meets.items()}
-        what = f"its times (t_s) lie within those of {_named(others)}: one machine cannot measure two runs at a time"
+        what = f"its times (t_s) lie within the times of {_named(others)}: one machine cannot measure two runs at a time"
         out.append(CampaignIssue(worst, what, "write t_s in s of one clock for the whole campaign: Abbe needs this to judge drift", False))
     if len(out) > 1 and 2 * len(out) >= len(spans):
         what = f"its t_s and those of {len(out)} other runs overlap: every run seems to have a clock of its own"
@@ -168,7 +168,7 @@ def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
     for k, run in enumerate(runs):
         for j in range(k):
             if _copied(rows[j], rows[k]) and (_shows_noise(run) or _copied(_timed(runs[j], rows[j]), _timed(run, rows[k]))):
-                what = f"its readings are those of run {runs[j].run_id}: one measurement would count twice"
+                what = f"its readings are the same as in run {runs[j].run_id}: one measurement would count twice"
                 out.append(CampaignIssue(run.run_id, what, "leave it out (--without), or export it again", True))
                 break
     return out

@@ -1,7 +1,7 @@
 """Listens while the operator runs a program: reads the laser continuously and turns each standstill into a reading of the recipe.
 
 This is for controllers that Abbe does not move. Abbe writes nothing to the controller and uses only its clock, its position and the status
-"NC program running"; it also works without a connected controller. Sample times are those of the laser's own clock, converted to the
+"NC program running"; it also works without a connected controller. Sample times come from the laser's own clock, converted to the
 controller's.
 """
 

@@ -183,7 +183,7 @@ class _Finder:
             how = f"resumes after {item.resume_trail.n_features} features; the first one is touched again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
-            how = f"resumes at {at} of its path, a stretch of which is read again"
+            how = f"resumes at {at} of its path, and reads a stretch before it again"
         messages.append(f"set-up {setup} is still mounted: {item.test.label} {how}")
         return item
 

@@ -116,7 +116,7 @@ def open_store(url: str, *, must_exist: bool = True) -> Store:
 
 
 def missing_file(url: str) -> str:
-    """Return the file of a SQLite database that does not exist; empty for every other database."""
+    """Return the path of a SQLite file that does not exist yet; empty if the file exists or the database is another kind."""
     from abbe.service.storage.engine import parse_url
 
     parsed = parse_url(url)

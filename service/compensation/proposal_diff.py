@@ -37,7 +37,7 @@ def compare(store: Store, number: int, with_what: str) -> TableDifference:
     """
     proposed = load(store, number)
     if with_what.upper() == ACTIVE:
-        name = f"the table in force when it was made ({proposed.candidate.base_crc:08X})"
+        name = f"the table in force when the proposal was made ({proposed.candidate.base_crc:08X})"
         return TableDifference(f"proposal {number}", name, changes(proposed.base_tables, proposed.tables))
     if not with_what.isdigit():
         raise TableRefused(f"--with {with_what!r} is neither ACTIVE nor the number of a proposal", "abbe comp show lists them")

@@ -114,7 +114,7 @@ class Proposed:
         return self.candidate.evidence.ended_s + self.limits.age_h * 3600.0
 
     def binding(self, expiry: str) -> str:
-        """Digest that an approval until ``expiry`` binds: this table on this base, for this machine, under these limits."""
+        """Digest of what an approval until ``expiry`` permits: this table on this base, for this machine, under these limits."""
         machine, limits = self.candidate.machine, self.limits.digest()
         return approval_digest(self.image, base_image=self.base.image, machine=machine, limits=limits, expiry=expiry)
 

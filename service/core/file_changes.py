@@ -1,7 +1,7 @@
 """Carries out changes of the machine file that a person makes on the page, and has the service start anew with the changed file.
 
-Rights are decided here. Nothing is changed while the machine is used, behind the back of an editor, or before the audit has the record. The
-file is judged by what judges it at a start, `abbe serve`'s own setup.
+Rights are decided here. A change is refused while the machine is used, or if somebody has edited the file meanwhile, and it is recorded in
+the audit before it is made. The setup of `abbe serve` judges the changed file, as at every start.
 """
 
 from __future__ import annotations
@@ -74,7 +74,7 @@ class FileChanges:
         self._source, self._context = source, context
 
     async def change(self, asked: ChangeFile) -> Answer:
-        """Change the file; a person's answer says why not. After "done" the service starts anew.
+        """Change the file, or answer why it is not changed. After "done" the service starts anew.
 
         What has begun is brought to its end even if nobody waits for the answer any more: a written file is always taken over.
         """

@@ -82,7 +82,7 @@ class Obstacle(FileObject):
     @model_validator(mode="after")
     def _a_box(self) -> Self:
         if any(low >= high for low, high in zip(self.low_mm, self.high_mm, strict=True)):
-            raise ValueError(f"obstacle {self.id}: every coordinate of low_mm must be below that of high_mm")
+            raise ValueError(f"obstacle {self.id}: every coordinate of low_mm must be below the same coordinate of high_mm")
         return self
 
 

@@ -239,7 +239,7 @@ def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssu
         return None
     worst = max(joint.runs, key=lambda run: run.rms_mm / run.expected_mm)
     what = (
-        f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, those of a usual "
+        f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, for a usual "
         f"machine {found.prior_mm * 1e3:.0f} µm: smooth motions do not fit these readings{instead}"
     )
     return CampaignIssue(worst.label, what, "look for the pitch of a screw or a kink of a rail: measure the axes in fine steps", False)

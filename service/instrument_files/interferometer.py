@@ -20,8 +20,8 @@ from abbe.service.rendering.numbers import plain, with_uncertainty
 NM = 1e-6
 """One nanometre, mm."""
 WHAT_IT_IS = (
-    "cyclic error of the interferometer (periodic nonlinearity), not of a drive: its period is the fringe, that of cyclic_error "
-    "the lead of a screw or the pitch of an encoder"
+    "cyclic error of the interferometer (periodic nonlinearity), not of a drive: its period is the fringe; the period of "
+    "cyclic_error is the lead of a screw or the pitch of an encoder"
 )
 CHANCE = 0.01
 UNITS = LENGTHS | ANGLES

@@ -215,7 +215,7 @@ class KnownArtefact:
     numbers: Mapping[str, float]
 
     def beside(self, earlier: KnownArtefact) -> KnownArtefact:
-        """Combine these facts with those of earlier files about the same artefact."""
+        """Combine these facts with the facts in earlier files about the same artefact."""
         return replace(self, features={**earlier.features, **self.features}, lengths=[*earlier.lengths, *self.lengths])
 
     def to_document(self) -> Doc:

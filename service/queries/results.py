@@ -70,7 +70,7 @@ class VolumeMap:
     """Deviation (actual minus nominal, best-fit rigid motion removed) at the nodes of an even grid over the strokes, X slowest.
 
     Nodes lie at every combination of ``x_mm``, ``y_mm``, ``z_mm``. ``motions``: the motions that make up the map. ``deviation_um``: dX, dY,
-    dZ; ``expanded_um``: their U and that of the length, k = 2. ``significant``: whether the 95 % ellipsoid around the deviation
+    dZ; ``expanded_um``: their U and the U of the length, k = 2. ``significant``: whether the 95 % ellipsoid around the deviation
     excludes zero; otherwise neither error nor direction is known. ``hidden``: motions without a map of their own.
     """
 
@@ -117,7 +117,7 @@ def solution(reader: Reader, number: int) -> SolutionDetail:
 def volume_map(reader: Reader, number: int, motions: Sequence[str], nodes: int) -> VolumeMap:
     """Return the volume map of a solution, rounded to 0.001 µm, which is far below every U.
 
-    ``motions``: the map shows their joint effect, or that of all motions if empty. ``nodes``: number per axis.
+    ``motions``: the map shows their joint effect, or the effect of all motions if empty. ``nodes``: number per axis.
     """
     reader.row("solutions", number, "solution")
     with as_stored():

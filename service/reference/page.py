@@ -145,7 +145,7 @@ INTRODUCTION = (
     " apart than the rounding of the printed inputs allows (column “within”), or a bound that holds, or equal only under an assumption that"
     " the row names. Differs: farther apart. Input: given, or zero by construction, so there is nothing to compute. Not reproducible: the"
     " paper does not print the necessary inputs. Rows “math.md” compare numbers of the mathematical specification that comes with the"
-    " vector files. They and own checks are not counted."
+    " vector files. These rows and own checks are not counted."
 )
 CHECKS = "An own check puts numbers of the paper into Abbe's functions and computes them back: it tests these functions, not the paper."
 _UNIT_AFTER = re.compile(r"(?<=\d) (?=(?:µm|mm|nm|µrad|mrad|rad|°|%)(?!\w))")

@@ -80,7 +80,7 @@ ALONE = "the deviation of the machine: one pose shows machine and form of the ar
 def pose_readings(run: Run, data: RunData) -> Evaluated:
     """One pose as it was read, without the motion that fits it best: its features, their rms and their largest deviation.
 
-    ``data``: observations of ``run``. The uncertainty is that of the touches alone. U of the largest deviation and of the arrows is that of
+    ``data``: observations of ``run``. The uncertainty contains the touches alone. U of the largest deviation and of the arrows holds for
     the largest of so many vectors (Sidak): noise alone exceeds it in at most 5 % of all poses.
     """
     p = data.points

@@ -165,7 +165,7 @@ class Prompts:
             self._now = self._done = None
 
     def answer(self, number: int) -> bool:
-        """Confirm the open prompt. Returns False and changes nothing if ``number`` is not that of the open prompt."""
+        """Confirm the open prompt. Returns False and changes nothing if ``number`` is not the number of the open prompt."""
         if self._now is None or self._done is None or self._now.number != number:
             return False
         self._now = None  # at once: a repeated confirmation has no effect

@@ -315,7 +315,7 @@ def origins_of(store: Store) -> dict[int, TableOrigin]:
 
 
 def open_pushes(store: Store, machine: str, control: str = "") -> list[str]:
-    """Describe the open pushes: the machine's own last one, and those of other journals whose unverified table may be in force.
+    """Describe the open pushes: the machine's own last one, and pushes of other journals whose unverified table may be in force.
 
     Another journal may belong to the same control under another name or address.
     """

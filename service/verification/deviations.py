@@ -204,7 +204,8 @@ def _notes(known: KnownErrors, points: PointsFile) -> list[str]:
     for axis, letter in enumerate(AXES):
         reverse = [key for key in known.motions.functions if key.endswith(letter + REVERSE)]
         if reverse and axis not in points.directed:
-            notes.append(f"no column direction_{letter.lower()}: {letter} counts as last moved in +, {', '.join(reverse)} not used")
+            unused = ", ".join(reverse)
+            notes.append(f"no column direction_{letter.lower()}: {letter} is taken as last moved in +, and {unused} is not used")
     return notes + _ends(known.motions, points)
 
 

@@ -41,7 +41,7 @@ LASER_STATEMENT = (
     "U of ISO 230-2 and 230-6 figures includes the scatter of the cycles, as far as repeats show it, the wavelength ({wave:.2g} µm/m), the "
     "temperature of the scales ({kelvin:.2g} K at {expansion:g} µm/m/K, or as stated for a reduced test) and the resolution, propagated "
     "through the figure's own formula (idea of ISO/TR 230-9). Deviations are as measured, except in groups that say at 20 °C. Where there "
-    "is one cycle, the scatter is that of the reversals about their mean."
+    "is one cycle, the scatter is the scatter of the reversals about their mean."
 )
 BAR_STATEMENT = (
     "U of ISO 230-4 figures includes the noise of a reading, {repeat:g} µm for remounting the bar (an assumption) and, for F alone, "

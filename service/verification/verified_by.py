@@ -75,7 +75,7 @@ class VerifiedBy:
 
     @property
     def holds(self) -> bool:
-        """Whether the verdict of a check may be shown as that of the machine."""
+        """Whether the verdict of a check may be shown as the verdict of the machine."""
         return self.why in ("check", "never")
 
     @computed_field  # type: ignore[prop-decorator]

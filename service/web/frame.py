@@ -186,7 +186,7 @@ def _frame_of(request: HTTPConnection, paths: frozenset[str] | None) -> tuple[di
 
 
 def language_of(request: HTTPConnection) -> str:
-    """Return the language that the request chooses, else that of its cookie, else the one that its header prefers."""
+    """Return the language that the request chooses, else the one in its cookie, else the one that its header prefers."""
     return _frame_of(request, None)[1].lang
 
 

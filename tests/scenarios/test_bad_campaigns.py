@@ -119,7 +119,7 @@ def test_a_run_that_stands_there_twice(seed, renamed):
         copy["columns"]["t_s"] = [v + 3600.0 for v in copy["columns"]["t_s"]]
         copy["setup"] |= {"setup_id": "again", "t_set_s": copy["setup"]["t_set_s"] + 3600.0}
     line = refusal(seed, [*runs, copy])
-    assert line.startswith(f"run r99: its readings are those of run {source}")
+    assert line.startswith(f"run r99: its readings are the same as in run {source}")
 
 
 def test_a_cropped_copy_among_the_held_out_runs():
@@ -127,7 +127,7 @@ def test_a_cropped_copy_among_the_held_out_runs():
     _, again = measured(5)
     copy = again[0]
     copy |= {"run_id": "r99", "role": "holdout", "columns": {k: v[100:400] for k, v in copy["columns"].items()}}
-    with pytest.raises(CampaignRefused, match=r"r99.*those of run helix0t0"):
+    with pytest.raises(CampaignRefused, match=r"r99.*same as in run helix0t0"):
         check_campaign(site, runs_of(runs), [run_of(copy)], "rigid21")
 
 
@@ -232,7 +232,7 @@ def test_repeats_of_a_coarse_sensor_are_no_copies():
     assert copy_issues(runs_of([coarse("a", 0.0), coarse("b", 300.0), coarse("c", 600.0)])) == []
     twice = copy_issues(runs_of([coarse("a", 0.0), coarse("b", 0.0)]))
     assert [f.run for f in twice] == ["b"]
-    assert "its readings are those of run a" in twice[0].line
+    assert "its readings are the same as in run a" in twice[0].line
 
 
 def test_visits_at_one_place_are_no_copy_of_the_line_that_passes_it():

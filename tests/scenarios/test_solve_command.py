@@ -241,7 +241,7 @@ def test_a_bad_run_in_the_store_stores_no_solution(command, tmp_path):
         import_folder(store, write_folder(tmp_path / "twice", site.doc, [*runs, again]))
     code, out, err = command("solve", "c1", "--db", "sqlite:///c.sqlite3")
     assert (code, out) == (2, "")
-    assert f"run twin: its readings are those of run {runs[1]['run_id']}" in err
+    assert f"run twin: its readings are the same as in run {runs[1]['run_id']}" in err
     with Store.open("sqlite:///c.sqlite3") as store:
         assert store.solutions.all() == []
 

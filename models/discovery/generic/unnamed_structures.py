@@ -171,7 +171,7 @@ SIGNALS: dict[str, Signal] = {
 
 
 def is_unnamed(name: str) -> bool:
-    """Whether an effect's name is that of a structure outside the catalogue."""
+    """Whether an effect is a structure outside the catalogue, by its name."""
     return name.startswith(PREFIX)
 
 

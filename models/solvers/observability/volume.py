@@ -29,7 +29,7 @@ USABLE, GOOD = 3.0, 10.0
 class Knowing:
     """Covariances of the error motions' coefficients in their own units, shape (p, p).
 
-    ``prior``: that of a typical machine; ``posterior``: that after the runs; ``noise``: the part of the posterior that comes from reading
+    ``prior``: of a typical machine; ``posterior``: after the runs; ``noise``: the part of the posterior that comes from reading
     noise, divided by the mean square of that noise, mm^2.
     """
 

@@ -38,7 +38,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     ],
     yes: Annotated[bool, typer.Option("--yes", help="Store the files without asking.")] = False,
     name: Annotated[
-        str | None, typer.Option("--name", help="Name of the campaign. Default: that of the first file.", show_default=False)
+        str | None, typer.Option("--name", help="Name of the campaign. Default: the name of the first file.", show_default=False)
     ] = None,
     columns: Annotated[
         Path | None, typer.Option("--columns", metavar="FILE", help="Description of a table's columns (TOML).", show_default=False)

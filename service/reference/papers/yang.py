@@ -229,7 +229,9 @@ def _derived() -> list[Comparison]:
     return [
         Comparison("Table 3", "largest |laser − bar|", "µm", paper.TABLE3_MAX, Computed(size), column, f"at {at:g} mm"),
         Comparison("Table 3", "mean |laser − bar|", "µm", paper.TABLE3_MEAN, Computed(float(np.abs(apart).mean())), f"{column}, 23 points"),
-        Comparison("3.3", f"the two lines apart at {end:g} mm", "µm", paper.LINES_AT_END, lines, "slopes of Table 2 times the travel"),
+        Comparison(
+            "3.3", f"difference of the two lines at {end:g} mm", "µm", paper.LINES_AT_END, lines, "slopes of Table 2 times the travel"
+        ),
     ]
 
 

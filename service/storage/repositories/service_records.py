@@ -195,7 +195,7 @@ class Replies(Repository):
     """Answers by idempotency key. A key belongs to its sender (``who``): two people may use the same text."""
 
     def claim(self, who: str, key: str, digest: str) -> ReplyRecord | None:
-        """Claim a key for a request of this digest. None: the caller has the key and must `keep` or `drop` it; else the stored reply."""
+        """Claim a key for the request with this digest. If the key is used, return its stored reply; None: now `keep` or `drop` the key."""
 
         def work(connection: Connection) -> ReplyRecord | None:
             now = self._db.utcnow()

@@ -60,7 +60,7 @@ class FleetLine:
 
     @property
     def share_u(self) -> float | None:
-        """Expanded uncertainty of `share` (k = 2); None if that of the figure is unknown."""
+        """Expanded uncertainty of `share` (k = 2); None if U of the figure is unknown."""
         one = self.worst
         return None if one is None or not one.limit or one.expanded is None else one.expanded / one.limit
 

@@ -179,7 +179,7 @@ def test_times_in_ms_and_runs_at_the_same_time_are_flagged_by_name():
     assert "t_s holds ms" in flag.what
     (flag,) = time_issues(runs_of([*good, fed(helix(), "e", 2010)]))
     assert {flag.run} <= {"b", "e"}
-    assert "lie within those of run" in flag.what
+    assert "lie within the times of run" in flag.what
 
 
 def test_columns_that_contradict_the_positions_are_flagged_by_name():

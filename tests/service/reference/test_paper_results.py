@@ -34,7 +34,7 @@ def test_yang_tables_come_out_as_math_md_8_says(everything):
     assert [(r.status, r.expected.text, r.expected.rounding) for r in (bar[0], apart[0])] == [("input", "0", 0.05)] * 2
     assert one(yang, "Table 3", "mean |laser − bar|").computed.value == pytest.approx(2.817, abs=5e-4)
     assert one(yang, "Table 3", "eighth position").computed.value == pytest.approx(254.0)
-    assert one(yang, "3.3", "the two lines apart at 812.8 mm").computed.value == pytest.approx(1.27, abs=5e-3)
+    assert one(yang, "3.3", "difference of the two lines at 812.8 mm").computed.value == pytest.approx(1.27, abs=5e-3)
     through = one(yang, "Table 2", "dxx, laser, line through origin")
     ordinary = one(yang, "Table 2", "dxx, laser, ordinary line")
     assert through.computed.value == pytest.approx(-8.5604e-5, abs=5e-10)
