@@ -63,7 +63,7 @@ Text = Annotated[str, AfterValidator(_escaped)]
 class DeviceTable(BaseModel):
     """Base of all tables of a device file: unknown keys are errors."""
 
-    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False)
+    model_config = ConfigDict(extra="forbid", strict=True, frozen=True, allow_inf_nan=False, defer_build=True)
 
 
 class DeviceValue(DeviceTable):

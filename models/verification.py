@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observations import RunData, bar_normals, nominal_reading
 from abbe.models.solvers.observe import LOST, predict, run_jacobian
 from abbe.models.solvers.priors import U_WAVELENGTH
+
+if TYPE_CHECKING:
+    from abbe.models.solvers.joint import JointSolution
 
 SAME_MM = 3.0
 U_REPEAT_MM = 1e-4

@@ -12,6 +12,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Item, Point
+from abbe.service.domain.machine_file import CaptureSettings
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
@@ -19,6 +20,7 @@ from abbe.service.push.validate import PushLimits
 
 Positive = Annotated[float, Field(gt=0.0)]
 
+MIB = 1 << 20
 SHORTEST_MM, LONGEST_MM = 50.0, 50_000.0
 """Range of real machines' strokes. A stroke up to 1.27 m, given in inches, falls below the shortest."""
 COLDEST_C, WARMEST_C = -20.0, 50.0
@@ -126,6 +128,10 @@ class StoreSection(ConfigTable):
         default=16.0, description="disk space reserved so that a run can be closed when the disk is full"
     )
     keep_segments: bool = Field(default=False, description="keep the capture files after their samples are in the database")
+
+    def for_capture(self) -> CaptureSettings:
+        """Return the settings of the capture."""
+        return CaptureSettings(self.capture, int(self.capture_reserve_mib * MIB), self.keep_segments)
 
 
 class Limits(ConfigTable):

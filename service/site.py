@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
-from abbe.service.capture.settings import MIB, CaptureSettings
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, control_of
+from abbe.service.domain.machine_file import CaptureSettings
+from abbe.service.errors import TableRefused
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
 from abbe.service.sequences.nc.write import NcSettings
@@ -94,7 +95,7 @@ def site_of(config: MachineFile) -> Site:
         limits.for_push(),
         limits.feed_mm_min,
         limits.temperature_c,
-        CaptureSettings(config.store.capture, int(config.store.capture_reserve_mib * MIB), config.store.keep_segments),
+        config.store.for_capture(),
         Watching(limits.run_temperature_c, Suspending(frozenset(limits.continue_after), limits.suspend_s, limits.settle_s)),
         NcSettings(config.nc.acceleration_mm_s2, config.nc.heidenhain_tool, {str(name): kib for name, kib in config.nc.memory_kib.items()}),
         config.calibration.until(),
@@ -119,3 +120,17 @@ def rules_of(config: MachineFile | None) -> Rules:
         config.issuer,
         config.item,
     )
+
+
+def check_certificates(site: Site) -> None:
+    """Check that an instrument has a certificate, before time is spent on measuring: without one, nothing can be pushed.
+
+    Raises
+    ------
+    TableRefused
+        The machine file names no certificate.
+    """
+    if not site.calibrated_until:
+        raise TableRefused(
+            "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
+        )

@@ -17,7 +17,7 @@ from abbe.service.errors import CampaignRefused, Unusable
 from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.checks import read_json
 from abbe.service.runs.columns import load_run
-from abbe.service.runs.exchange import CAMPAIGN_FILE, import_folder, read_folder, write_folder
+from abbe.service.runs.exchange import import_folder, read_folder, write_folder
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.store import Store
 
@@ -73,11 +73,6 @@ class Campaign:
             raise Unusable(f"campaign {self.name} is not as it was measured", f"`abbe export {self.name} --out FOLDER` writes a stored one")
         known = None if errors is None or self.folder is None else read_json(self.folder / errors)
         return write_folder(self.doc, self.runs, self.tables, known, Path(folder))
-
-
-def is_folder(campaign: str) -> bool:
-    """Whether an argument names a campaign folder rather than a campaign of the store."""
-    return (Path(campaign) / CAMPAIGN_FILE).exists() or Path(campaign).is_dir()
 
 
 def from_folder(folder: Path) -> Campaign:

@@ -10,7 +10,7 @@ from typing import Any
 
 from abbe.drivers.api import DeviceInfo, Point
 from abbe.drivers.errors import DriverError, LinkDown, Rebooted, ReplyTimeout
-from abbe.service.campaigns.plausibility import BEFORE_S
+from abbe.service.campaigns.device_checks import BEFORE_S
 from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.columns import path_progress

@@ -22,8 +22,8 @@ from abbe.models.alignment.dwell import DwellReading, Dwells, PlannedDwell, dete
 from abbe.models.alignment.lag import Lag, fit_lag
 from abbe.models.arrays import F1, F2
 from abbe.models.machine import AXES
+from abbe.service.campaigns.device_checks import check_devices
 from abbe.service.campaigns.measure import OpenCampaign, start_campaign, start_document
-from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session

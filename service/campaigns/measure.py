@@ -24,7 +24,7 @@ from abbe.service.campaigns.campaign_run import (
     plan_hash,
     read_path,
 )
-from abbe.service.campaigns.plausibility import check_devices
+from abbe.service.campaigns.device_checks import check_devices
 from abbe.service.capture.live import LiveFeed
 from abbe.service.capture.machine_reading import LatestReading
 from abbe.service.capture.recorder import CaptureRecorder, close_run, recording

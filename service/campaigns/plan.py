@@ -36,7 +36,7 @@ Length = Annotated[float, Field(ge=10.0, le=2000.0)]
 
 
 class _TomlTable(BaseModel):
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
 
 class SetupTable(_TomlTable):

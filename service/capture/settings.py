@@ -6,15 +6,14 @@ import hashlib
 import os
 import re
 import tempfile
-from dataclasses import dataclass
 from itertools import count
 from pathlib import Path
 
+from abbe.service.domain.machine_file import CaptureSettings as CaptureSettings
 from abbe.service.errors import ConfigError
 from abbe.service.storage.engine import parse_url
 from abbe.service.storage.store import Store
 
-MIB = 1 << 20
 SUFFIX = ".seg"
 ORPHAN = ".orphan"
 """Suffix of a segment set aside because this database has no run for it, or because its closed run lacks some of its records."""
@@ -24,19 +23,6 @@ DAMAGED_SUFFIX = ".damaged"
 """Suffix of a segment set aside because of damage between good records; its readable records are in the database."""
 TAIL = ".tail"
 """Suffix of a copy of the tail that was cut off a segment."""
-
-
-@dataclass(frozen=True, slots=True)
-class CaptureSettings:
-    """Settings of the capture.
-
-    ``folder``: local folder for segments, empty: beside the SQLite file. ``reserve_bytes``: disk space reserved for closing a run on a full
-    disk. ``keep``: keep segments although the database has everything.
-    """
-
-    folder: str = ""
-    reserve_bytes: int = 16 * MIB
-    keep: bool = False
 
 
 def is_memory(database_url: str) -> bool:

@@ -170,6 +170,24 @@ def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
         return found
 
 
+def check_endings(*targets: Path | None) -> None:
+    """Refuse a report's file with an unknown ending, before the work; None is no file. Raises FileFormatError."""
+    if given := list(filter(None, targets)):
+        from abbe.service.rendering.document_page import form_of
+
+        for target in given:
+            form_of(target)
+
+
+def check_inputs(*files: Path) -> None:
+    """Refuse a file or folder that does not exist, before what reads it is loaded. Raises FileFormatError."""
+    from abbe.service.errors import FileFormatError
+
+    for file in files:
+        if not file.exists():
+            raise FileFormatError(f"{file}: no such file", "give an existing file or folder")
+
+
 def print_json(value: Any) -> None:
     """Write a value as JSON to stdout."""
     from abbe.service.secrets import visible_json

@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, answer, answer_into, conclude, machine_file
+from abbe.service.cli.common import JsonOption, MachineOption, answer, answer_into, check_endings, conclude, machine_file
 
 if TYPE_CHECKING:
     from collections.abc import AsyncIterator
@@ -69,22 +69,20 @@ def measure(  # noqa: PLR0913 - one argument for each option
     as_json: JsonOption = False,
 ) -> None:
     """Measure a campaign on the machine and store every sample. Ctrl-C stops at a safe place, a second one at once; SIGUSR1 pauses."""
-    from abbe.service.campaigns.resume import begun_source
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
-    from abbe.service.sequences.check import dry_run_campaign, paced
     from abbe.service.site import site_of
-    from abbe.service.storage.store import Store
 
     rehearsal, file = Rehearsal(dry_run, path, picture, nc, out), machine_file(machine)
     instead = rehearsal.check((file, Path(recipe)))
     loaded = load_machine(file)
     site, source = site_of(loaded.machine), _source(recipe, helix, rate_hz)
     if resume:
-        with Store.open(loaded.database_url) as store:
-            store.campaigns.find(resume)
-            source = source if recipe or helix else begun_source(store, resume)
+        source = _begun(loaded, resume, source if recipe or helix else None)
     plan = source.plan(site.machine)
+
+    from abbe.service.sequences.check import dry_run_campaign, paced
+
     plan = replace(paced(plan, site.max_feed_mm_min), name=resume or name or f"{plan.name} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
     runs = dry_run_campaign(site.machine, plan, site.max_feed_mm_min)
     with answer_into(None if nc else out):
@@ -206,6 +204,16 @@ async def _measured(store: Store, site: Site, plan: CampaignPlan, control: Contr
             await work(session, store, site, plan, progress=sink, options=MeasureOptions(control, confirm, source, found))
 
 
+def _begun(loaded: LoadedMachine, campaign: str, source: RecipeSource | None) -> RecipeSource:
+    """Return the source of a campaign to resume: the given one, else its own from the store."""
+    from abbe.service.campaigns.resume import begun_source
+    from abbe.service.storage.store import Store
+
+    with Store.open(loaded.database_url) as store:
+        store.campaigns.find(campaign)
+        return source or begun_source(store, campaign)
+
+
 def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
     """Return the source of a plan; it includes a recipe file's text, so that a resumed campaign does not need the file."""
     from abbe.service.sequences.recipes.campaigns import RecipeSource
@@ -227,18 +235,19 @@ def correct(
     as_json: JsonOption = False,
 ) -> None:
     """Solve a campaign, push nine tables, measure again; roll back to the old table if the machine is not better (exit code 1)."""
-    from abbe.service.cli.running import rollback_when_safe, run_job
-    from abbe.service.compensation.correct import correct as work_correct
-    from abbe.service.compensation.gate import PushContext, check_preconditions
-    from abbe.service.compensation.proposals import check_certificates
     from abbe.service.config import load_machine
-    from abbe.service.errors import TakenBack
-    from abbe.service.site import site_of
-    from abbe.service.storage.store import Store
+    from abbe.service.site import check_certificates, site_of
 
     loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     check_certificates(site)
+
+    from abbe.service.cli.running import rollback_when_safe, run_job
+    from abbe.service.compensation.correct import correct as work_correct
+    from abbe.service.compensation.gate import PushContext, check_preconditions
+    from abbe.service.errors import TakenBack
+    from abbe.service.storage.store import Store
+
     poses = checking_poses(site, check)
 
     hints: list[str] = []
@@ -353,19 +362,21 @@ def listen(
     as_json: JsonOption = False,
 ) -> None:
     """Record the laser while the operator runs the NC program of a recipe; each standstill of the program becomes a reading."""
+    from abbe.service.sequences.recipes.recipe_file import read_recipe
+
+    title, recipes = read_recipe(recipe)
+
     from abbe.service.campaigns.listen import listen_campaign
     from abbe.service.cli.running import run_job
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
     from abbe.service.sequences.check import paced
-    from abbe.service.sequences.recipes.recipe_file import read_recipe
     from abbe.service.sequences.steps import CampaignPlan
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
 
     loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
-    title, recipes = read_recipe(recipe)
     plan = CampaignPlan(title, tuple(r.plan(site.machine) for r in recipes))
     plan = replace(paced(plan, site.max_feed_mm_min), name=name or f"{title} {SystemClock().utc():%Y-%m-%d %H:%M:%S}")
 
@@ -403,12 +414,10 @@ class Rehearsal:
             Two options do not go together, or an output file would overwrite an input.
         """
         from abbe.service.errors import ConfigError
-        from abbe.service.rendering.document_page import form_of
 
         if self.picture is not None and not self.dry_run:
             raise ConfigError("--picture draws a dry run", "add --dry-run")
-        if self.picture is not None:
-            form_of(self.picture)
+        check_endings(self.picture)
         if self.path and not self.dry_run:
             raise ConfigError("--path prints the positions of a dry run", "add --dry-run")
         if self.nc and self.out is None:

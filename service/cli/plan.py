@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import JsonOption, MachineOption, conclude, machine_file, print_json, print_table
+from abbe.service.cli.common import JsonOption, MachineOption, check_endings, conclude, machine_file, print_json, print_table
 
 if TYPE_CHECKING:
     from abbe.service.campaigns.plan import PlannedCampaign
@@ -36,23 +36,22 @@ def plan(  # noqa: PLR0913 - one argument for each option
     as_json: JsonOption = False,
 ) -> None:
     """Plan a campaign: what to measure, in which order, and how far each measurement lowers U. Nothing moves."""
+    file = machine_file(machine)
+    _check_targets((out,) if artefact is not None else (out, picture), (file, instruments, artefact))
+    check_endings(picture)
+
     from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report, read_instruments
     from abbe.service.cli.running import display
     from abbe.service.config import load_machine
-    from abbe.service.rendering.document_page import form_of, write_document
+    from abbe.service.rendering.document_page import write_document
     from abbe.service.rendering.page_file import write_page
     from abbe.service.site import site_of
 
-    file = machine_file(machine)
     site = site_of(load_machine(file).machine)
     if artefact is not None:
-        _check_targets((out,), (file, artefact))
         _plan_poses(site, artefact, minutes, out, as_json=as_json)
         return
     tools = read_instruments(instruments)
-    _check_targets((out, picture), (file, instruments))
-    if picture is not None:
-        form_of(picture)  # refuse a wrong suffix before the work
     with display() as sink:
         planned = plan_for(site, minutes=minutes, goal_um=goal_um, tools=tools, progress=sink)
     if out is not None:

@@ -11,7 +11,7 @@ import math
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
 from pathlib import Path
@@ -117,18 +117,16 @@ def reach_note(doc: dict[str, Any]) -> list[str]:
     return notes
 
 
-def solution_document(source: str, stored: Callable[[int], dict[str, Any]]) -> dict[str, Any]:
-    """Read a solution: by its number from the database (``stored``), or from a JSON file (`abbe solve --json`).
+def solution_document(source: Path) -> dict[str, Any]:
+    """Read a solution from a JSON file (`abbe solve --json`).
 
     Raises
     ------
     FileFormatError
         The file cannot be read or is not a JSON object.
     """
-    if source.isdigit():
-        return stored(int(source))
     try:
-        doc = json.loads(read_plain(Path(source), LARGEST_SOLUTION))
+        doc = json.loads(read_plain(source, LARGEST_SOLUTION))
     except OSError as error:
         raise FileFormatError(f"{source}: cannot be read: {error.strerror}", "give the number of a solution or a file") from None
     except UnicodeDecodeError:

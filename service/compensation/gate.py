@@ -16,7 +16,7 @@ from typing import Any
 
 from abbe.drivers.api import TableController
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.plausibility import check_devices
+from abbe.service.campaigns.device_checks import check_devices
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.proposal_decisions import valid_approval

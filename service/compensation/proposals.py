@@ -371,20 +371,6 @@ def check_temperature(site: Site, runs: list[Run]) -> None:
                 )
 
 
-def check_certificates(site: Site) -> None:
-    """Check that an instrument has a certificate, before time is spent on measuring: without one, nothing can be pushed.
-
-    Raises
-    ------
-    TableRefused
-        The machine file names no certificate.
-    """
-    if not site.calibrated_until:
-        raise TableRefused(
-            "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
-        )
-
-
 async def load_runs(store: Store, run_ids: list[int]) -> list[Run]:
     """Load runs in a thread, so that the event loop is not blocked."""
     return await asyncio.to_thread(lambda: [load_run(store, k) for k in run_ids])

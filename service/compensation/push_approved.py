@@ -6,76 +6,27 @@ last push, and tables that have not drifted too far in 30 days. Each push first 
 
 from __future__ import annotations
 
-from collections.abc import Awaitable, Callable, Sequence
-from dataclasses import dataclass
-
 from abbe.drivers.errors import DriverError
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.clock import Clock
+from abbe.service.compensation.approved import PushOrder
 from abbe.service.compensation.correct import push
 from abbe.service.compensation.gate import PushContext, admit
-from abbe.service.compensation.proposal_decisions import proposal_status
-from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import finish_when_safe, recovered_session, with_notes
 from abbe.service.devices.session import lock_machine
 from abbe.service.domain.job_state import JobOutcome
-from abbe.service.domain.progress import ProgressSink
 from abbe.service.domain.run import Run
-from abbe.service.domain.service_records import AlarmEntryRecord, AlarmKind
-from abbe.service.errors import AbbeError, MachineInUse, StillActive, StoreError, TableRefused, TakenBack
+from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableRefused, TakenBack
 from abbe.service.sequences.check import paced
-from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.control import State
 from abbe.service.sequences.recipes.campaigns import verification
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED
-from abbe.service.verification.alarm_states import NO_ALARM
 
 WAIT_S = 600.0
 """How long to wait for a machine on which the rollback is blocked; then the service reports it and retries."""
-
-Begun = Callable[[], Awaitable[None]]
-"""Called at least once when this process has locked the machine: from then on the attempt counts."""
-
-
-@dataclass(frozen=True, slots=True)
-class ApprovedProposal:
-    """A proposal that waits for the service: its number, its valid approval, and the alarm that caused it (0: none)."""
-
-    proposal: int
-    approval: int
-    alarm: int
-
-
-@dataclass(frozen=True, slots=True)
-class PushOrder:
-    """One attempt: proposal number, callbacks for its begin and its progress, and the `Control` by which a person may stop it."""
-
-    proposal: int
-    begun: Begun
-    progress: ProgressSink
-    control: Control
-
-
-def next_approved(store: Store, machine: str, entries: Sequence[AlarmEntryRecord], now_s: float) -> ApprovedProposal | None:
-    """The proposal that was approved last, if the service has not tried it with this approval; None: nothing waits.
-
-    Older approved proposals are not tried in its place: the last approval supersedes them.
-    """
-    tried = {e.facts.approval for e in entries if e.kind == AlarmKind.PUSHING}
-    asked = {e.facts.proposal: e.alarm for e in entries if e.kind == AlarmKind.PROPOSED}
-    given = [(rows[-1].id, record.id) for record in store.proposals.all(machine) if (rows := store.proposals.approvals(record.id))]
-    if not given:
-        return None
-    approval, number = max(given)
-    try:
-        word = proposal_status(store, number, load(store, number), now_s).word
-    except StoreError:  # a changed row: its page reports it, and it is never pushed
-        return None
-    if word == "approved" and approval not in tried:
-        return ApprovedProposal(number, approval, asked.get(number, NO_ALARM))
-    return None
 
 
 async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Clock, rate_hz: int = 100) -> JobOutcome:

@@ -17,9 +17,9 @@ import structlog
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, Outcome, PushNow, RollBack
 from abbe.service.clock import Clock
+from abbe.service.compensation.approved import PushOrder
 from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.compensation.rollback import RollbackOrder, RollbackRequest
 from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand, no_alarms
 from abbe.service.domain.audit_event import AuditEvent

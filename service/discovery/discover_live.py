@@ -11,8 +11,8 @@ from dataclasses import dataclass, replace
 from itertools import groupby
 
 from abbe.service.campaign_data.campaign_folder import Campaign, from_store
+from abbe.service.campaigns.device_checks import check_devices
 from abbe.service.campaigns.measure import measure, start_campaign
-from abbe.service.campaigns.plausibility import check_devices
 from abbe.service.devices.session import Session
 from abbe.service.discovery.discover import DiscoveryJob, prepare
 from abbe.service.discovery.discovery_store import StoredJournal, journal_of

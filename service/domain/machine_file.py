@@ -64,3 +64,16 @@ class MachineFileSummary:
             head, dot, _ = one.key.partition(".")
             found.setdefault(head.partition("[")[0] if dot else "", []).append(one)
         return found
+
+
+@dataclass(frozen=True, slots=True)
+class CaptureSettings:
+    """Settings of the capture.
+
+    ``folder``: local folder for segments, empty: beside the SQLite file. ``reserve_bytes``: disk space reserved for closing a run on a full
+    disk. ``keep``: keep segments although the database has everything.
+    """
+
+    folder: str = ""
+    reserve_bytes: int = 16 << 20
+    keep: bool = False

@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from dataclasses import dataclass
-from fnmatch import fnmatchcase
 from multiprocessing import get_context
 from typing import Any, Protocol, TypeVar
 
@@ -125,7 +124,7 @@ def solve_task(task: ReanalysisTask) -> ReanalysisResult:
 
 def tasks_of(store: Store, url: str, pattern: str, model: Model) -> list[ReanalysisTask]:
     """Return one task for each campaign whose name matches the pattern (``june-*``), in order of their numbers."""
-    return [ReanalysisTask(url, one.name, model) for one in store.campaigns.all() if fnmatchcase(one.name, pattern)]
+    return [ReanalysisTask(url, name, model) for name in store.campaigns.matching(pattern)]
 
 
 def solve_all(tasks: Sequence[ReanalysisTask], executor: Executor, store: Store | None = None) -> Iterator[ReanalysisResult]:

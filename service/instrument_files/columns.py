@@ -35,7 +35,7 @@ Column = Annotated[str | int, Field(description="heading of the column, or its n
 class ColumnFilePart(BaseModel):
     """Base of the objects of a column file: unknown keys are mistakes."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, defer_build=True)
 
 
 class MeasuredColumn(ColumnFilePart):

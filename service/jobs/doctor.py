@@ -13,7 +13,8 @@ from typing import Any, Literal
 from abbe.drivers import registry
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import installed, parse_url, split_report, untested_remedy
-from abbe.service.campaigns.plausibility import check_plausibility, check_sensors
+from abbe.service.campaigns.device_checks import check_sensors
+from abbe.service.campaigns.plausibility import check_plausibility
 from abbe.service.config import LoadedMachine
 from abbe.service.devices.session import lock_machine, no_console
 from abbe.service.errors import AbbeError, MachineInUse

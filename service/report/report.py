@@ -280,9 +280,6 @@ def _sizes(tables: NineTables | None) -> list[ReportFigure]:
     return out
 
 
-NUMBERED = ("push", "discovery", "verification")
-
-
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:
     """The report as a certificate of the laboratory that the rules name, if any. ``measured_on``: day of the measurement, for a report
     that does not know it; ``issued``: day of issue."""

@@ -12,7 +12,7 @@ import structlog
 
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.clock import Clock
-from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved
+from abbe.service.compensation.approved import ApprovedProposal, PushOrder, next_approved
 from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.job_state import JobOutcome
 from abbe.service.domain.progress import ProgressSink
@@ -26,8 +26,9 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import OPEN, STOPPED, JournalView, reconciled
 from abbe.service.verification import verify
+from abbe.service.verification.alarm_rules import READ_CHECKS, check_facts, evaluate_alarm
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note, folded, step_alone
-from abbe.service.verification.alarms import READ_CHECKS, alarm_numbered, alarms_of, check_facts, evaluate_alarm, last_seq
+from abbe.service.verification.alarms import alarm_numbered, alarms_of, last_seq
 
 log = structlog.get_logger("abbe.alarm")
 

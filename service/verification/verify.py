@@ -7,12 +7,11 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from abbe.drivers.errors import DriverError
-from abbe.models.solvers.joint import JointSolution
 from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure, same_pose
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.run import ArtefactSetup, Run
@@ -21,6 +20,9 @@ from abbe.service.domain.verification import CheckFailure, CheckResult, Verdict
 from abbe.service.errors import AbbeError, MeasurementFault, TableRefused
 from abbe.service.runs.coverage import check_judged
 from abbe.service.runs.observations import run_data
+
+if TYPE_CHECKING:
+    from abbe.models.solvers.joint import JointSolution
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1

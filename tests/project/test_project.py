@@ -175,6 +175,7 @@ OPENS = (
     | {"check-config": {"fastapi", "alembic", "aiomqtt", "structlog", "rich"}}
 )
 """The same of commands that only read; a list needs no arrays, but a trend of stored checks needs them and `scipy.special`."""
+MACHINE = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY = [0, 400]\nZ = [-300, 0]\n'
 SOLVING = {"abbe.service.identification.solve", "abbe.service.discovery.discover", "scipy.linalg", "scipy.optimize", "scipy.stats"}
 """What only computing commands import."""
 
@@ -196,12 +197,40 @@ def test_a_command_that_computes_nothing_comes_at_once(words: str) -> None:
 @pytest.mark.parametrize("words", OPENS)
 def test_a_command_that_only_reads_the_database_comes_soon(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ABBE_DB", raising=False)
-    (tmp_path / "abbe.toml").write_text('name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY = [0, 400]\nZ = [-300, 0]\n')
+    (tmp_path / "abbe.toml").write_text(MACHINE)
     Store.open(f"sqlite:///{tmp_path}/abbe.sqlite3").close()
     loaded = modules(tool("abbe"), *words.split(), folder=tmp_path, fails=True)
     assert "abbe.service.config" in loaded
     assert not {name.partition(".")[0] for name in loaded} & OPENS[words]
     assert not loaded & SOLVING
+
+
+READS_NO_DATABASE = {"numpy", "scipy", "sqlalchemy", "pymodbus", "fastapi"}
+REFUSES = (
+    dict.fromkeys(
+        ("serve -m none.toml", "check-config -m none.toml", "plan --out none/x.toml", "errors --errors none --points none"),
+        READS_NO_DATABASE,
+    )
+    | dict.fromkeys(
+        ("solve none", "discover none", "simulate none", "report none", "export none x", "comp show 99"), READS_NO_DATABASE - {"sqlalchemy"}
+    )
+    | dict.fromkeys(
+        ("comp propose none", "comp export 99 --format linuxcnc --out x", "accept-table", "backup x"), READS_NO_DATABASE - {"sqlalchemy"}
+    )
+    | {"correct june": {"pymodbus", "abbe.models.solvers", "abbe.service.identification"}}
+)
+"""What a command must not import for an input that it refuses. Those of the last two lines write the refusal into the audit."""
+
+
+@pytest.mark.parametrize("words", REFUSES)
+def test_a_refused_input_loads_nothing_of_the_work(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("ABBE_DB", raising=False)
+    (tmp_path / "abbe.toml").write_text(MACHINE)
+    (tmp_path / "x").mkdir()
+    Store.open(f"sqlite:///{tmp_path}/abbe.sqlite3").close()
+    loaded = modules(tool("abbe"), *words.split(), folder=tmp_path, fails=True)
+    assert "typer" in loaded
+    assert not loaded & REFUSES[words]
 
 
 def test_an_idle_service_holds_no_library_of_mathematics() -> None:
@@ -213,10 +242,11 @@ def test_an_idle_service_holds_no_library_of_mathematics() -> None:
 
 def test_an_idle_core_holds_nothing_that_answers_alarms() -> None:
     """What solves, searches, proposes and draws comes with the first campaign: 5 MB less."""
-    loaded = modules("-c", "import abbe.service.serve, abbe.service.compensation.push_approved")
+    loaded = modules("-c", "import abbe.service.serve")
     assert "abbe.service.core.orders" in loaded
     seldom = {"abbe.service.jobs.investigate", "abbe.service.jobs.guided_campaign", "abbe.service.discovery.discover"}
-    assert not {*seldom, "abbe.models.uncertainty.monte_carlo", "abbe.service.report.report"} & loaded
+    solving = {"abbe.service.identification.solve", "abbe.service.compensation.push_approved", "abbe.models.solvers.joint"}
+    assert not {*seldom, *solving, "abbe.models.effects.catalogue", "abbe.service.report.report"} & loaded
 
 
 def test_every_row_of_what_you_own_names_a_test_that_exists() -> None:

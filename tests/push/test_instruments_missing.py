@@ -18,7 +18,8 @@ import pytest
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import SystemClock
 from abbe.service.compensation import pushing
-from abbe.service.compensation.push_approved import PushOrder, push_approved
+from abbe.service.compensation.approved import PushOrder
+from abbe.service.compensation.push_approved import push_approved
 from abbe.service.config import load_machine
 from abbe.service.domain.measured import this_process
 from abbe.service.domain.progress import ignore_progress

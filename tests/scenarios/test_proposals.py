@@ -16,12 +16,13 @@ import pytest
 
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.approved import ApprovedProposal, PushOrder, next_approved
 from abbe.service.compensation.correct import Correction, push
 from abbe.service.compensation.gate import PushContext, admit, precheck
 from abbe.service.compensation.proposal_decisions import approve, proposal_status, status_of_proposal
 from abbe.service.compensation.proposal_doc import digest_of_doc, load
 from abbe.service.compensation.proposals import load_runs
-from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder, next_approved, push_approved
+from abbe.service.compensation.push_approved import push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
 from abbe.service.domain.decisions import ProposalApproval

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaigns.measure import MeasureOptions, measure
-from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
+from abbe.service.compensation.approved import ApprovedProposal, PushOrder
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import recover
 from abbe.service.config_schema import Web

@@ -21,7 +21,7 @@ from abbe.service.clock import SystemClock
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
-from abbe.service.verification.alarms import READ_CHECKS, check_facts, evaluate_alarm
+from abbe.service.verification.alarm_rules import READ_CHECKS, check_facts, evaluate_alarm
 from tests.pages_world import PHRASE, Filled, filled_once, served
 from tests.pretended_push import KEPT, as_if_pushed
 from tests.system.finger import Finger

@@ -79,9 +79,8 @@ def restore(
 def _source(db: str | None, machine: Path | None) -> BackupSource:
     """Return what to back up: the database given by ``db`` or by the machine file, which also gives the folder of samples."""
     from abbe.service.backup.backup import BackupSource
-    from abbe.service.capture.settings import CaptureSettings
     from abbe.service.config import load_machine
-    from abbe.service.site import site_of
+    from abbe.service.domain.machine_file import CaptureSettings
 
     url, file = database_url(db, machine), named_machine(machine) if db is None else None
-    return BackupSource(url, CaptureSettings() if file is None else site_of(load_machine(file).machine).capture, file)
+    return BackupSource(url, CaptureSettings() if file is None else load_machine(file).machine.store.for_capture(), file)

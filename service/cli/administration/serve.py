@@ -15,7 +15,7 @@ if TYPE_CHECKING:
 
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineSummary
-    from abbe.service.compensation.push_approved import PushOrder
+    from abbe.service.compensation.approved import PushOrder
     from abbe.service.compensation.rollback import RollbackOrder
     from abbe.service.config import LoadedMachine
     from abbe.service.config_schema import AlarmSection, OpcUa, Web
@@ -49,11 +49,14 @@ def serve(
     """Run scheduled checks unattended, publish results, show a status page. Ends on Ctrl-C or SIGTERM."""
     from abbe.service.config import load_machine
     from abbe.service.files import file_locks
-    from abbe.service.logs import configure_logs
-    from abbe.service.serve import serve as run
 
     file_locks()
-    setup = setup_of(load_machine(machine_file(machine)), port)
+    loaded = load_machine(machine_file(machine))
+
+    from abbe.service.logs import configure_logs  # the service: not for a file that is wrong
+    from abbe.service.serve import serve as run
+
+    setup = setup_of(loaded, port)
     configure_logs(as_json=as_json)
     code = run(setup, once=once)
     word = {0: "all checks passed", 1: "not all checks passed"}.get(code, "ended by a fault") if once else "ended"
@@ -156,11 +159,12 @@ def _broker(loaded: LoadedMachine) -> Broker | None:
 
 
 def _opcua(loaded: LoadedMachine) -> OpcUa | None:
-    from abbe.service.plant.opcua.setup import check_opcua
-
     given = loaded.machine.opcua
     if not given.enabled:
         return None
+
+    from abbe.service.plant.opcua.setup import check_opcua  # cryptography
+
     clients = tuple(_beside(loaded.path, name) for name in given.clients)
     files = {"certificate": _beside(loaded.path, given.certificate), "key": _beside(loaded.path, given.key), "clients": clients}
     setup = given.model_copy(update=files)
@@ -176,7 +180,6 @@ def duties_on(
     ``plan``: the full campaign; ``rate_hz``: ball-bar rate of verifications; ``live``: gets the samples of the campaign's paths.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.push_approved import push_approved
     from abbe.service.scheduler.alarm_manager import Duties
 
     def duties(store: Store) -> Duties:
@@ -188,6 +191,8 @@ def duties_on(
             await investigate(InvestigationContext(site, store, plan, clock, progress, control, live), one, note)
 
         async def push(order: PushOrder) -> JobOutcome:
+            from abbe.service.compensation.push_approved import push_approved
+
             return await push_approved(site, store, order, clock=clock, rate_hz=rate_hz)
 
         return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
@@ -201,7 +206,6 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
     A push can be ordered only if the service never pushes by itself.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.compensation.push_approved import push_approved
     from abbe.service.compensation.rollback import ordered_rollback
     from abbe.service.core.orders import OrderActions
 
@@ -210,6 +214,8 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
             return await ordered_rollback(site, store, order, clock=SystemClock())
 
         async def push(order: PushOrder) -> JobOutcome:
+            from abbe.service.compensation.push_approved import push_approved
+
             return await push_approved(site, store, order, clock=SystemClock())
 
         return OrderActions(back, push if alarm.push == "never" else None)

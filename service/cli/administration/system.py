@@ -104,14 +104,16 @@ def check_config(
     as_json: JsonOption = False,
 ) -> None:
     """Check a machine file and print its effective values with their origins; exit code 2 if something cannot work."""
-    from abbe.service.campaigns.plausibility import check_plausibility
-    from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
-    from abbe.service.errors import ConfigError
-    from abbe.service.secrets import mask_secrets, visible
 
     file = machine_file(machine)
     loaded = load_machine(file)
+
+    from abbe.service.campaigns.plausibility import check_plausibility
+    from abbe.service.clock import SystemClock
+    from abbe.service.errors import ConfigError
+    from abbe.service.secrets import mask_secrets, visible
+
     found = check_plausibility(loaded.machine, loaded.path.resolve().parent, SystemClock().utc().date())
     database = mask_secrets(loaded.database_url)
     if as_json:

@@ -9,7 +9,17 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, conclude, database_url, named_machine, open_store, print_json
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    check_endings,
+    conclude,
+    database_url,
+    named_machine,
+    open_store,
+    print_json,
+)
 from abbe.service.cli.measure import AcceptTable
 from abbe.service.cli.results.solve import stored_campaign
 
@@ -44,16 +54,15 @@ def discover(  # noqa: PLR0913 - one argument for each option
     temperatures show the thermal response (ISO 230-3), and points of artefacts show which errors move with the part and which belong to
     the machine; neither result is stored.
     """
-    from abbe.service.clock import SystemClock
-    from abbe.service.discovery.discovery_answer import answer_doc
-    from abbe.service.rendering.document_page import form_of, write_document
-    from abbe.service.report.report_discovery import found_report
-
-    if report is not None:
-        form_of(report)  # refuse a wrong suffix before the work
+    check_endings(report)
     if live:
         machine = _checked_live(campaign, machine)
     with opened(campaign, db, machine, without or []) as (found, store):
+        from abbe.service.clock import SystemClock
+        from abbe.service.discovery.discovery_answer import answer_doc
+        from abbe.service.rendering.document_page import write_document
+        from abbe.service.report.report_discovery import found_report
+
         if _without_search(found, plain=report is None and not live, as_json=as_json):
             conclude(f"abbe {'report' if found.folder is None else 'import'} {quote(campaign)}", machine=machine, db=db, as_json=as_json)
             return
@@ -99,9 +108,9 @@ def _without_search(campaign: Campaign, *, plain: bool, as_json: bool) -> bool:
 @contextmanager
 def opened(campaign: str, db: str | None, machine: Path | None, without: list[str]) -> Iterator[tuple[Campaign, Store | None]]:
     """Yield a campaign and its store; the store is None for a folder if no database is named."""
-    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder
+    if Path(campaign).is_dir():
+        from abbe.service.campaign_data.campaign_folder import from_folder
 
-    if is_folder(campaign):
         found = from_folder(Path(campaign)).without(without)
         with ExitStack() as stack:
             named = db is not None or machine is not None
@@ -128,12 +137,11 @@ def _started(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Dis
 
 def _checked_live(campaign: str, machine: Path | None) -> Path:
     """Return the machine file for --live; refuse, before anything is read, if there is none or the campaign is in a folder."""
-    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
 
     if (found := named_machine(machine)) is None:
         raise ConfigError("--live needs the machine", "give -m FILE")
-    if is_folder(campaign):
+    if Path(campaign).is_dir():
         raise ConfigError("--live needs a campaign of the store, not a folder", "measure it with `abbe measure`")
     return found
 

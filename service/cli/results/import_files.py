@@ -14,6 +14,7 @@ from abbe.service.cli.common import (
     JsonOption,
     MachineOption,
     answer,
+    check_inputs,
     conclude,
     database_url,
     named_machine,
@@ -70,6 +71,8 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     Temperatures given as options apply to files that state none. -m FILE: the machine with its chain and strokes, and its
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
+    check_inputs(*files)
+
     from abbe.service.instrument_files.answers import Answers
     from abbe.service.instrument_files.point_list import is_point_list
     from abbe.service.instrument_files.registry import read_file

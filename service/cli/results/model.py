@@ -70,14 +70,15 @@ def show_model(
     as_json: JsonOption = False,
 ) -> None:
     """Show one version: its effects with their size, their remedy, and the runs they came from."""
-    from abbe.service.discovery.discovery_text import size_text
-    from abbe.service.effects.model_book import REMEDIES
-
     with open_store(database_url(db, machine)) as store:
         found = _version(store, _name(store, of, db, machine), version)
     if as_json:
         print_json(_doc(found))
         return
+
+    from abbe.service.discovery.discovery_text import size_text
+    from abbe.service.effects.model_book import REMEDIES
+
     typer.echo(f"machine {found.machine}, model version {found.version}: {found.book.why}")
     rows = [(e.full_title, size_text(e), f"{REMEDIES[e.remedy]}: {e.remedy_text}", e.origin.campaign) for e in found.book.effects]
     print_table(("effect", "size, U (k = 2)", "remedy", "from campaign"), rows)
@@ -100,14 +101,16 @@ def diff_models(
     as_json: JsonOption = False,
 ) -> None:
     """Show the effects that were added, removed or resized between two versions."""
-    from abbe.service.discovery.effect_pages import unit
-    from abbe.service.effects.effect_catalogue import catalogue
     from abbe.service.effects.model_book import differences, version
-    from abbe.service.rendering.numbers import with_uncertainty
 
     with open_store(database_url(db, machine)) as store:
         name = _name(store, of, db, machine)
         a, b = version(store, name, first), _version(store, name, second)
+
+    from abbe.service.discovery.effect_pages import unit
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.rendering.numbers import with_uncertainty
+
     found = differences(a, b, catalogue())
     if as_json:
         rows = [{"label": d.label, "what": d.what, "unit": d.unit, "before": _size(d.before), "after": _size(d.after)} for d in found]

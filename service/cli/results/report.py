@@ -13,6 +13,7 @@ from abbe.service.cli.common import (
     JsonOption,
     MachineOption,
     answer,
+    check_endings,
     conclude,
     database_url,
     named_machine,
@@ -27,6 +28,7 @@ if TYPE_CHECKING:
     from abbe.service.rendering.document import Document
 
 
+NUMBERED = ("push", "discovery", "verification")
 OUT_HELP = "FILE.pdf, .html, .csv, .json, .xml (DCC), .dfq (AQDEF) or .qif; may be repeated. Default: a PDF here."
 
 
@@ -62,22 +64,21 @@ def report(  # noqa: PLR0913 - one argument for each option
     reduced to 20 °C. Nothing is measured or computed again; the same data give the same bytes. A digital calibration certificate (.xml)
     needs [issuer] in the machine file and is not signed.
     """
-    from abbe.service.campaign_data.campaign_folder import is_folder
+    check_endings(*(out or []))
+    # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
+    url = database_url(db, machine if db is None else None)
+    identifies = number is None and what not in NUMBERED and _identifies(what, url)
+
     from abbe.service.clock import SystemClock
     from abbe.service.config import load_machine
-    from abbe.service.rendering.document_page import default_name, form_of, write_document
-    from abbe.service.report.report import NUMBERED, certified
+    from abbe.service.rendering.document_page import default_name, write_document
+    from abbe.service.report.report import certified
     from abbe.service.site import rules_of
     from abbe.service.verification.reduction import AT_20, DIAGONAL_AT_20
 
-    for target in out or []:
-        form_of(target)  # refuse a wrong suffix before the work
     # A folder and another database may be of another machine: its file has to be named.
-    file = machine if db is not None or is_folder(what) else named_machine(machine)
-    config = None if file is None else load_machine(file).machine
-    rules = rules_of(config)
-    # Both may be given: the machine file for its limits, and another database (an archive, a fleet's).
-    url = database_url(db, machine if db is None else None)
+    file = machine if db is not None or Path(what).is_dir() else named_machine(machine)
+    rules = rules_of(None if file is None else load_machine(file).machine)
     document = certified(_document(what, number, of, url, rules), rules, _day(measured_on), SystemClock().utc().date())
     targets = out or [Path(default_name(document))]
     for target in targets:
@@ -87,7 +88,7 @@ def report(  # noqa: PLR0913 - one argument for each option
     doc = {"files": [str(target) for target in targets], "title": document.title, "verdict": word, "text": text}
     lines = [*(f"report: {target}" for target in targets), f"{document.title}: {word}. {text}".strip(), *reduced]
     answer(doc, *lines, as_json=as_json)
-    if what not in NUMBERED and _identifies(what, url):
+    if identifies:
         conclude(f"abbe solve {quote(what)}", machine=machine, db=db, as_json=as_json)
     else:
         conclude("abbe trend", machine=machine, as_json=as_json)
@@ -95,10 +96,9 @@ def report(  # noqa: PLR0913 - one argument for each option
 
 def _identifies(what: str, url: str) -> bool:
     """Return whether a campaign, folder or run has runs to solve: a check has none."""
-    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.domain.measured import RunRecord
 
-    if is_folder(what):
+    if Path(what).is_dir():
         return True
     with open_store(url) as store:
         found = run_or_campaign(store, what)
@@ -117,9 +117,8 @@ def _day(text: str | None) -> date | None:
 
 
 def _document(what: str, number: int | None, of: str | None, url: str, rules: Rules) -> Document:
-    from abbe.service.campaign_data.campaign_folder import is_folder
     from abbe.service.errors import ConfigError
-    from abbe.service.report.report import NUMBERED, folder_report, numbered_report, stored_report
+    from abbe.service.report.report import folder_report, numbered_report, stored_report
 
     if what in NUMBERED:
         if number is None:
@@ -128,7 +127,7 @@ def _document(what: str, number: int | None, of: str | None, url: str, rules: Ru
             return numbered_report(store, what, number, rules, of)
     if number is not None:
         raise ConfigError(f"{what} {number}: only {', '.join(NUMBERED)} have a number", "give one name: a run, a campaign or a folder")
-    if is_folder(what):
+    if Path(what).is_dir():
         return folder_report(Path(what), rules)
     with open_store(url) as store:
         return stored_report(store, run_or_campaign(store, what), rules)

@@ -97,12 +97,7 @@ def show(
 ) -> None:
     """Show one run: state, set-up and statistics of its columns (--json: as an exchange file). For a campaign, show its runs and
     incidents."""
-    from abbe.service.cli.results.show import show_campaign
     from abbe.service.domain.measured import RunRecord
-    from abbe.service.queries.measured import run_summary
-    from abbe.service.queries.reader import json_value
-    from abbe.service.runs.columns import run_document, single_run, whole_run
-    from abbe.service.runs.coverage import not_judged, with_state
 
     with open_store(database_url(db, machine)) as store:
         record = run_or_campaign(store, run)
@@ -110,6 +105,12 @@ def show(
             show_campaign(store, record.id, as_json=as_json)
             conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
             return
+
+        from abbe.service.queries.measured import run_summary
+        from abbe.service.queries.reader import json_value
+        from abbe.service.runs.columns import run_document, single_run, whole_run
+        from abbe.service.runs.coverage import not_judged, with_state
+
         chunks = store.chunks.of_run(record.id)
         facts = json_value(run_summary(record, store.machines.get(store.campaigns.find(record.campaign_id).machine_id).name))
         found = whole_run(store, record) if record.visible_status == "complete" else with_state(single_run(record, chunks), record)
@@ -170,10 +171,12 @@ def export_campaign(
     as_json: JsonOption = False,
 ) -> None:
     """Write a campaign as a folder with campaign.json, one file for each run, and the compensation tables in force, if any."""
-    from abbe.service.runs.exchange import export_folder
-    from abbe.service.tables.measured_with import images_of
-
     with open_store(database_url(db, machine)) as store:
+        store.campaigns.find(campaign)
+
+        from abbe.service.runs.exchange import export_folder  # numpy: not for a wrong name
+        from abbe.service.tables.measured_with import images_of
+
         written = export_folder(store, campaign, folder, images_of(store), csv=csv)
         count = len(store.runs.all(store.campaigns.find(campaign).id))
     text = f"exported campaign {campaign!r} with {count} runs to {written}"

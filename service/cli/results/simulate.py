@@ -9,12 +9,24 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from abbe.service.cli.common import DbOption, JsonOption, MachineOption, conclude, machine_file, print_json, print_table
+from abbe.service.cli.common import (
+    DbOption,
+    JsonOption,
+    MachineOption,
+    check_endings,
+    check_inputs,
+    conclude,
+    machine_file,
+    print_json,
+    print_table,
+)
 from abbe.service.cli.results.discover import opened
 
 if TYPE_CHECKING:
+    from abbe.service.campaign_data.campaign_folder import Campaign
     from abbe.service.discovery.discover import DiscoveryJob
     from abbe.service.discovery.simulate import Simulation
+    from abbe.service.storage.store import Store
     from abbe.service.verification.deviations import Deviations
 
 
@@ -33,34 +45,40 @@ def simulate(
 
     The present model is the campaign's, with the effects of the machine's model book.
     """
-    from abbe.service.cli.running import display
-    from abbe.service.discovery.discover import prepare
-    from abbe.service.discovery.simulate import simulate as work
-    from abbe.service.discovery.simulate import simulation_doc
-    from abbe.service.domain.progress import Progress
-    from abbe.service.effects.effect_catalogue import catalogue
-    from abbe.service.effects.model_book import current
-    from abbe.service.identification.removal import campaign_table
-    from abbe.service.rendering.document_page import form_of
-
-    if report is not None:
-        form_of(report)  # refuse a wrong suffix before the work
-    with opened(campaign, db, machine, without or []) as (found, store), display() as sink:
-        sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
-        base = None if store is None else current(store, found.site.name)
-        job = prepare(found, catalogue(), base, table=campaign_table(store, found))
-        sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
-        simulation = work(job)
-        sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))
+    check_endings(report)
+    with opened(campaign, db, machine, without or []) as (found, store):
+        job, simulation = _simulated(found, store)
     if report is not None:
         _write_report(job, simulation, report)
     if as_json:
+        from abbe.service.discovery.simulate import simulation_doc
+
         print_json(simulation_doc(job, simulation))
         return
     _print_simulation(job, simulation)
     if report is not None:
         typer.echo(f"report: {report}")
     conclude(f"abbe discover {quote(campaign)}", machine=machine, db=db)
+
+
+def _simulated(campaign: Campaign, store: Store | None) -> tuple[DiscoveryJob, Simulation]:
+    """Fit the present model and predict every run, with progress on stderr."""
+    from abbe.service.cli.running import display
+    from abbe.service.discovery.discover import prepare
+    from abbe.service.discovery.simulate import simulate as work
+    from abbe.service.domain.progress import Progress
+    from abbe.service.effects.effect_catalogue import catalogue
+    from abbe.service.effects.model_book import current
+    from abbe.service.identification.removal import campaign_table
+
+    with display() as sink:
+        sink(Progress("simulate", 0.0, 2.0, None, "runs checked against each other"))
+        base = None if store is None else current(store, campaign.site.name)
+        job = prepare(campaign, catalogue(), base, table=campaign_table(store, campaign))
+        sink(Progress("simulate", 1.0, 2.0, None, "present model fitted to the identify runs"))
+        simulation = work(job)
+        sink(Progress("simulate", 2.0, 2.0, 0.0, "done"))
+    return job, simulation
 
 
 def _write_report(job: DiscoveryJob, simulation: Simulation, target: Path) -> None:
@@ -106,6 +124,8 @@ def errors(
 
     -m also takes a machine object (docs/schemas/machine.schema.json), as TOML or JSON.
     """
+    check_inputs(errors_file, points)
+
     from abbe.service.verification.deviations import deviations, deviations_json
 
     found = deviations(machine_file(machine), errors_file, points, exact=exact)

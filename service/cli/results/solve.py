@@ -16,6 +16,7 @@ from abbe.service.cli.common import (
     JsonOption,
     MachineOption,
     answer_into,
+    check_endings,
     conclude,
     database_url,
     missing_file,
@@ -94,21 +95,18 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     A folder's result is stored only if --db or -m names a database; tables of this database are then used, too. A run that
     contradicts its description is refused (exit code 2).
     """
-    from abbe.service.campaign_data.campaign_folder import from_folder, is_folder, store_solution
-    from abbe.service.domain.solution_file import SolutionFile
     from abbe.service.errors import ConfigError
-    from abbe.service.rendering.document_page import form_of
-    from abbe.service.runs.points import read_points
 
-    if report is not None:
-        form_of(report)  # refuse a wrong suffix before the work
+    check_endings(report)
     if at is not None and out is None:
         raise ConfigError("--at and --out belong together", "give both: --at POINTS.csv --out FILE.csv")
     # A folder and another database may be of another machine: its file has to be named.
-    file = machine if db is not None or is_folder(campaign) else named_machine(machine)
-    points, target = (None, None) if at is None else (read_points(at).axes_mm, out)
+    file = machine if db is not None or Path(campaign).is_dir() else named_machine(machine)
+    points, target = (None, None) if at is None else (_points(at), out)
     wanted = _SolveRequest(model, tables, grid, nodes, unit_um * 1e-3, trials, points, file, target, without_scale)
-    if is_folder(campaign):
+    if Path(campaign).is_dir():
+        from abbe.service.campaign_data.campaign_folder import from_folder, store_solution
+
         found = from_folder(Path(campaign))
         chosen = found.without(without or [])
         url = None if db is None and machine is None else database_url(db, machine)
@@ -122,6 +120,8 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
             _write_report(None, chosen, summary, doc, machine, report)
     else:
         with stored_campaign(campaign, database_url(db, machine)) as (store, found):
+            from abbe.service.campaign_data.campaign_folder import store_solution
+
             chosen = found.without(without or [])
             summary, doc = _solved(store, chosen, wanted)
             doc |= store_solution(store, found, doc)
@@ -131,9 +131,18 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         if as_json:
             print_json(doc)
             return
+        from abbe.service.domain.solution_file import SolutionFile
+
         print_solution(summary, SolutionFile.read(doc), details=details)
         _name_files({"report": report, "grid": grid, "deviation": target})
     _conclude(campaign, doc, db, machine)
+
+
+def _points(file: Path) -> F2:
+    """Return the points of ``--at``, mm."""
+    from abbe.service.runs.points import read_points
+
+    return read_points(file).axes_mm
 
 
 def _name_files(files: dict[str, Path | None]) -> None:
@@ -168,18 +177,19 @@ class _SolveRequest:
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
     """Yield the store and its campaign of that name. Raises StoreError for an unknown name, which is no folder either."""
-    from abbe.service.campaign_data.campaign_folder import from_store
     from abbe.service.errors import StoreError
 
     with ExitStack() as stack:
         try:
             store = stack.enter_context(open_store(url))
-            found = from_store(store, name)
+            store.campaigns.find(name)
         except StoreError as exc:
             raise type(exc)(
                 f"{name} is neither a folder with campaign.json nor a campaign of the database ({exc.detail})", exc.remedy
             ) from exc
-        yield store, found
+        from abbe.service.campaign_data.campaign_folder import from_store  # numpy and the solver's data: not for a wrong name
+
+        yield store, from_store(store, name)
 
 
 def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
@@ -270,14 +280,16 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
 ) -> None:
     """Solve many campaigns of a database again, each exactly as abbe solve does; exit code 1 if one was refused."""
     from abbe.service.errors import NotStored
-    from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of
-    from abbe.service.identification.reanalysis import solve_all as run
 
     url = database_url(db, machine)
     with open_store(url) as store:
-        tasks = tasks_of(store, url, pattern, model.value)
-        if not tasks:
+        if not store.campaigns.matching(pattern):
             raise NotStored(f"no campaign matches {pattern!r} in {store.url}", "`abbe runs` lists what there is")
+
+        from abbe.service.identification.reanalysis import HEADINGS, row, tasks_of
+        from abbe.service.identification.reanalysis import solve_all as run
+
+        tasks = tasks_of(store, url, pattern, model.value)
         answers = list(run(tasks, _executor(workers, dask), store if store_solutions else None))
     if as_json:
         print_json([answer.doc or {"campaign": answer.campaign, "refused": answer.refused} for answer in answers])

@@ -12,6 +12,7 @@ from abbe.service.cli.common import (
     DbOption,
     JsonOption,
     MachineOption,
+    check_inputs,
     conclude,
     database_url,
     named_machine,
@@ -91,6 +92,8 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     as_json: JsonOption = False,
 ) -> None:
     """Write the best tables that a control can hold, and show the error that each kind of table would leave."""
+    doc = _solution(solution, db, machine)
+
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import (
         TableSeal,
@@ -108,7 +111,6 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
     )
     from abbe.service.verification.reduction import UNKNOWN
 
-    doc = _solution(solution, db, machine)
     known = identified(doc, without_scale=without_scale)
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
@@ -143,13 +145,16 @@ def write_step(
 ) -> None:
     """Write the 10 µm step of a format, the test before any real table is loaded, and print its place and expected reading."""
     from abbe.models.machine import AXES
-    from abbe.service.compensation.comp_export import control_for, reference_of, settings_for, write_files
     from abbe.service.errors import FormatRefused
     from abbe.service.formats.registry import format_of
-    from abbe.service.formats.step import step_of
 
     if axis not in AXES:
         raise FormatRefused(f"--axis {axis!r}: expected X, Y or Z", "name the axis that is tested")
+    format_of(form)
+
+    from abbe.service.compensation.comp_export import control_for, reference_of, settings_for, write_files
+    from abbe.service.formats.step import step_of
+
     found, nominal, at = format_of(form), _machine(machine), reference_of(reference)
     start = nominal.stroke_mm[:, 0] if at is None else at
     step = step_of(found, nominal, AXES.index(axis), start)
@@ -186,6 +191,8 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     """Read a control's files as the control would: show the tables, their status (signed for this machine, or only a candidate), and how
     they differ from a solution's.
     """
+    check_inputs(file)
+
     from abbe.service.clock import SystemClock
     from abbe.service.compensation.comp_export import (
         SigningRequest,
@@ -228,13 +235,13 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
 
 
 def _solution(source: str, db: str | None, machine: Path | None) -> dict[str, Any]:
+    """Return a solution's document: by its number from the database, or from a file of `abbe solve --json`."""
+    if source.isdigit():
+        with open_store(database_url(db, machine)) as store:
+            return dict(store.solutions.get(int(source)).doc)
     from abbe.service.compensation.comp_export import solution_document
 
-    def stored(number: int) -> dict[str, Any]:
-        with open_store(database_url(db, machine)) as store:
-            return dict(store.solutions.get(number).doc)
-
-    return solution_document(source, stored)
+    return solution_document(Path(source))
 
 
 def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none: bool) -> bool:
@@ -244,7 +251,7 @@ def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none:
     from abbe.service.tables.measured_with import check_fresh, images_of, stored_tables, tables_of
 
     if not source.isdigit():
-        return check_fresh(tables_of(solution_document(source, lambda _: {})), no_image, confirmed_none=confirmed_none)
+        return check_fresh(tables_of(solution_document(Path(source))), no_image, confirmed_none=confirmed_none)
     with open_store(database_url(db, machine)) as store:
         return check_fresh(stored_tables(store, int(source)), images_of(store), confirmed_none=confirmed_none)
 

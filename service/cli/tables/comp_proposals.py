@@ -13,6 +13,7 @@ from abbe.service.cli.common import (
     JsonOption,
     MachineOption,
     answer,
+    check_endings,
     conclude,
     database_url,
     machine_file,
@@ -40,21 +41,24 @@ def propose(
     as_json: JsonOption = False,
 ) -> None:
     """Solve a campaign and store the resulting tables as a proposal; nothing is written to the controller (exit code 1: objections)."""
+    from abbe.service.config import load_machine
+    from abbe.service.storage.store import Store
+
+    loaded = load_machine(machine_file(machine))
+    with Store.open(loaded.database_url) as store:
+        store.campaigns.find(campaign)
+
     from dataclasses import replace
 
     from abbe.service.cli.running import display, run_job
     from abbe.service.compensation.proposals import gather, make
-    from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
     from abbe.service.identification.solve_report import assess
     from abbe.service.site import site_of
-    from abbe.service.storage.store import Store
 
-    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> StoredProposal:
-        store.campaigns.find(campaign)
         with display() as sink:
             async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
                 gathered = await gather(session.controller, store, site, campaign)
@@ -96,10 +100,13 @@ def show_proposals(
     as_json: JsonOption = False,
 ) -> None:
     """Show proposals: the improvement they promise with its uncertainty, their state, the reasons against them."""
-    from abbe.service.queries import tables
-    from abbe.service.queries.reader import json_value
-
     with open_store(database_url(db, machine)) as store:
+        if proposal is not None:
+            store.proposals.get(proposal)
+
+        from abbe.service.queries import tables
+        from abbe.service.queries.reader import json_value
+
         if proposal is None:
             found_all = tables.proposals(reader(store), None, None, MOST)[0]
             _print_list(found_all, as_json=as_json)
@@ -149,20 +156,23 @@ def diff(
     as_json: JsonOption = False,
 ) -> None:
     """Show the changes of a proposal: each of the nine tables in numbers, and as a picture."""
-    from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
-    from abbe.service.compensation.proposal_doc import load
-    from abbe.service.queries.reader import json_value
-    from abbe.service.queries.tables import difference_of
-    from abbe.service.rendering.document_page import form_of, write_document
-
-    if html is not None:
-        form_of(html)  # refuse a wrong suffix before the work
+    check_endings(html)
     with open_store(database_url(db, machine)) as store:
+        store.proposals.get(proposal)
+
+        from abbe.service.compensation.proposal_diff import HEADINGS, compare, diff_report, largest, rows
+        from abbe.service.compensation.proposal_doc import load
+
         found = compare(store, proposal, other)
         proposed = load(store, proposal)
     if html is not None:
+        from abbe.service.rendering.document_page import write_document
+
         write_document(diff_report(found, proposed), html)
     if as_json:
+        from abbe.service.queries.reader import json_value
+        from abbe.service.queries.tables import difference_of
+
         print_json(json_value(difference_of(found)))
         return
     print_table(HEADINGS, rows(found), title=f"{found.new} against {found.old}; U: k = 2")
@@ -183,13 +193,15 @@ def approve(
     as_json: JsonOption = False,
 ) -> None:
     """Approve this one table as replacement of the present one, for this machine and its limits (exit code 1: not approved)."""
-    from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_decisions import approve as work_approve
-    from abbe.service.errors import TableRefused
-    from abbe.service.tables.push_journal import open_pushes
-    from abbe.service.users.account import login
-
     with open_store(database_url(db, machine)) as store:
+        store.proposals.get(proposal)
+
+        from abbe.service.clock import SystemClock
+        from abbe.service.compensation.proposal_decisions import approve as work_approve
+        from abbe.service.errors import TableRefused
+        from abbe.service.tables.push_journal import open_pushes
+        from abbe.service.users.account import login
+
         try:
             done = work_approve(store, proposal, name.strip() or login(), hours, SystemClock())
         except TableRefused as error:
@@ -224,13 +236,15 @@ def reject(
     as_json: JsonOption = False,
 ) -> None:
     """Reject a proposal permanently: it cannot be approved or pushed (exit code 1: it cannot be rejected any more)."""
-    from abbe.service.clock import SystemClock
-    from abbe.service.compensation.proposal_decisions import reject as work_reject
-    from abbe.service.errors import TableRefused
-    from abbe.service.queries import tables
-    from abbe.service.users.account import login
-
     with open_store(database_url(db, machine)) as store:
+        store.proposals.get(proposal)
+
+        from abbe.service.clock import SystemClock
+        from abbe.service.compensation.proposal_decisions import reject as work_reject
+        from abbe.service.errors import TableRefused
+        from abbe.service.queries import tables
+        from abbe.service.users.account import login
+
         try:
             done = work_reject(store, proposal, name.strip() or login(), reason, SystemClock())
             campaign = tables.proposal(reader(store), proposal).campaign

@@ -137,17 +137,19 @@ def accept_table(
     """Accept the active table as right, so that work can continue: after an interrupted push that Abbe could not resolve, or if this
     database did not push the table. Closes open pushes under any machine name. The push journal records who and when.
     """
+    from abbe.service.errors import ConfigError
+
+    if not yes:
+        raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
+
     from abbe.service.compensation.recover import accept
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls, open_session
-    from abbe.service.errors import ConfigError
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
     from abbe.service.users.account import by_whom
     from abbe.service.verification.verified_by import measure_now
 
-    if not yes:
-        raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
     loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
 

@@ -113,7 +113,7 @@ AnyTest = Annotated[
 class RecipeFile(BaseModel):
     """Content of a recipe file; ``test``: its tests in the order of measuring; ``artefact``: what is probed, by name."""
 
-    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True)
+    model_config = ConfigDict(extra="forbid", allow_inf_nan=False, frozen=True, defer_build=True)
 
     format: Literal["abbe-recipe/1"]
     name: Annotated[str, Field(min_length=1, max_length=120)]

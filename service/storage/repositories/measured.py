@@ -10,6 +10,7 @@ import hashlib
 import json
 import zlib
 from collections.abc import Mapping, Sequence
+from fnmatch import fnmatchcase
 from types import MappingProxyType
 
 from sqlalchemy import Connection, func, insert, select, update
@@ -84,6 +85,10 @@ class Campaigns(Repository):
     def all(self) -> list[CampaignRecord]:
         """List all campaigns, oldest first."""
         return self._all(CAMPAIGN)
+
+    def matching(self, pattern: str) -> list[str]:
+        """List the names that match a pattern (``june-*``), oldest first."""
+        return [one.name for one in self.all() if fnmatchcase(one.name, pattern)]
 
 
 def machine_id_of(connection: Connection, name: str, doc: Doc, now: str) -> int:

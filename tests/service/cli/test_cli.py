@@ -120,7 +120,7 @@ def test_check_config_mistakes(abbe: Abbe, machine: Path) -> None:
         (["runs", "--db", "postgresql://me:topsecret@127.0.0.1:1/x"], "me:***@127.0.0.1:1/x"),
         (["show", "r01", "--db", "sqlite://"], "error STO-002: no run 'r01' in sqlite://"),
         (["export", "c1", "out", "--db", "sqlite://"], "error STO-002: no campaign 'c1' in sqlite://"),
-        (["import", "nowhere", "--db", "sqlite://"], "error FMT-001: nowhere/campaign.json: no such file"),
+        (["import", "nowhere", "--db", "sqlite://"], "error FMT-001: nowhere: no such file"),
     ],
 )
 def test_bad_input_is_one_line(abbe: Abbe, arguments: list[str], message: str) -> None:

@@ -17,8 +17,8 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Steering, SteerJob
 from abbe.service.compensation import push_approved
+from abbe.service.compensation.approved import ApprovedProposal, PushOrder
 from abbe.service.compensation.gate import PushContext
-from abbe.service.compensation.push_approved import ApprovedProposal, PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import push_is_open
 from abbe.service.devices.session import ENVIRONMENT

@@ -29,8 +29,9 @@ from abbe.service.scheduler.retrying_store import StoreShelf
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
+from abbe.service.verification.alarm_rules import AlarmTerms, found_in, series_begins
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note
-from abbe.service.verification.alarms import AlarmTerms, acknowledge, alarms_of, found_in, series_begins
+from abbe.service.verification.alarms import acknowledge, alarms_of
 from tests.service.core.fakes import FakeClock, FakeWatcher, Result, utc
 
 START = utc(2026, 3, 1, 5)

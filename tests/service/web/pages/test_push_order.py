@@ -14,8 +14,8 @@ import pytest
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, PushNow
 from abbe.service.clock import SystemClock
+from abbe.service.compensation.approved import PushOrder
 from abbe.service.compensation.proposal_decisions import approve
-from abbe.service.compensation.push_approved import PushOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
 from abbe.service.domain.job_state import JobOutcome, JobState
