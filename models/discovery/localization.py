@@ -74,7 +74,7 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     -------
     Localization
         Tests, runs, axes and directions of the path in which the signal is strong, and, only if it is confined, the time and the position
-        that hold 90 % of its energy. Empty for a signal of zeros.
+        that hold 90 % of its energy. Empty for a signal of zeros. Runs in one direction only do not locate a direction.
     """
     rows = _signal_rows(paths, signal)
     if not rows.energy.sum() > 0:
@@ -84,7 +84,7 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     ways = {d: float(np.mean(rows.energy[rows.direction == d])) for d in (1, -1) if (rows.direction == d).any()}
     time_s, (place, radius) = _time(rows), _place(rows)
     return Localization(
-        tests=_strong(_by_test(paths, signal)), axes=_strong(dict(zip(AXES, along.tolist(), strict=True))), directions=_strong(ways),
+        tests=_strong(_by_test(paths, signal)), axes=_strong(dict(zip(AXES, along.tolist(), strict=True))), directions=_strong(ways) if len(ways) == 2 else (),
         runs=_strong(mean), time_s=time_s, position_mm=place, radius_mm=radius,
     )  # fmt: skip
 
@@ -183,10 +183,12 @@ def locate(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Localization:
         return tuple(dict.fromkeys(g.value.removesuffix(NEIGHBOURS).removesuffix(DIFFER) for g in significant if g.kind == kind))
 
     spread = localize_signal(paths, _excess(rows, paths))
+    both = len({float(d) for p in paths for d in np.sign(p.direction)} - {0.0}) == 2  # one direction alone says nothing of the other
     return Localization(
-        tests=values("test") or values("instrument"), axes=values("axis"), directions=tuple(int(v) for v in values("direction")),
+        tests=values("test") or values("instrument"), axes=values("axis"), directions=tuple(int(v) for v in values("direction") if both),
         runs=values("run"), time_s=spread.time_s, position_mm=spread.position_mm, radius_mm=spread.radius_mm,
-        depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS)), table=significance,
+        depends_on=tuple(dict.fromkeys(DEPENDS[g.kind] for g in significant if g.kind in DEPENDS and (both or g.kind != "direction"))),
+        table=significance,
     )  # fmt: skip
 
 

@@ -31,6 +31,20 @@ def test_one_axis_both_ways() -> None:
     assert where.table[0].value.startswith("Y") or any("Y up and down" in s.value and s.p < 1e-3 for s in where.table)
 
 
+def test_runs_in_one_direction_do_not_say_that_the_other_is_calm() -> None:
+    """The runs back are often the holdout runs, which are not fitted: an effect of both directions was told as "only forward"."""
+    ahead = tuple(p for p in PATHS if np.all(p.direction > 0))
+    rest = tuple(e + 3.0 * p.look[:, 0] for e, p in zip(noise(ahead, 2), ahead, strict=True))
+    where = locate(ahead, rest)
+    assert "X" in where.axes
+    assert where.directions == ()
+    assert "direction" not in where.depends_on
+    assert localize_signal(ahead, rest).directions == ()
+    again = tuple(3.0 * p.look[:, 0] * (p.direction > 0) for p in PATHS)
+    assert locate(PATHS, with_(list(again))).directions == (1,)
+    assert localize_signal(PATHS, again).directions == (1,)
+
+
 def test_one_run_in_time() -> None:
     add = [np.where(np.arange(p.n) > p.n // 2, 2.0, 0.0) * (p.label == "c11000") for p in PATHS]
     add[4] = np.where(np.arange(PATHS[4].n) > 120, 2.5, 0.0)
