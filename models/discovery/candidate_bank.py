@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from itertools import product
 
 import numpy as np
@@ -51,7 +52,7 @@ class Pick:
         parts += [problem.raw(f.signal, self.key, self.values) for f in self.forms]
         return np.concatenate(parts, axis=1)
 
-    @property
+    @cached_property
     def start(self) -> str:
         """Identifier of the pick's columns: label, non-linear parameters and forms."""
         return f"{self.label} {sorted(self.values.items())} {[f.name for f in self.forms]}"
@@ -205,28 +206,43 @@ def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[s
     blocks = [(p, raw) for p, raw in ((p, p.raw(problem)) for p in picks) if raw.any()]
     if not blocks:
         return
-    raw = np.asfortranarray(np.concatenate([b.T for _, b in blocks]).T)  # the layout in which filtering along the runs is fastest
+    raw = np.concatenate([b.T for _, b in blocks]).T  # columns one after the other, the layout in which whitening is fastest
+    widths = [(p, b.shape[1]) for p, b in blocks]
+    del blocks  # each copy of the columns takes megabytes
     columns, projection = problem.white(raw), problem.projection
     coordinates = projection.coordinates(columns)
     rhs = columns.T @ projection.y - coordinates.T @ projection.y_coordinates
     own = np.einsum("nk,nk->k", columns, columns)
     short = columns.T.astype(np.float32)
-    size = np.abs(raw)
     start = 0
-    for p, block in blocks:
-        at = slice(start, start + block.shape[1])
+    for p, width in widths:
+        at = slice(start, start + width)
         start = at.stop
         gram = columns[:, at].T @ columns[:, at] - coordinates[:, at].T @ coordinates[:, at]
-        sees = (size[:, at] > VISIBLE_SHARE * size[:, at].max()).sum(axis=0)
+        size = np.abs(raw[:, at])
+        sees = (size > VISIBLE_SHARE * size.max()).sum(axis=0)
         yield p.start, _Group(short[at], own[at], gram, rhs[at], float(np.log(np.maximum(sees, 2)).sum()))
 
 
-def gain_of(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
-    """Reduction of chi-square by one pick; ``rows`` project out other picks.
+@dataclass(frozen=True, eq=False)
+class Taken:
+    """Picks that are projected out: their identifiers (`Pick.start`), and their rows, shape (k, n) (`SignalProjection.rows`)."""
 
-    The gain needs double precision: where the projection leaves little of a column, single precision would cause errors of several units
-    in a gain of thousands.
-    """
+    names: tuple[str, ...]
+    rows: F2
+
+
+def gain_of(problem: WhitenedProblem, pick: Pick, taken: Taken) -> float:
+    """Reduction of chi-square by one pick beside others; the problem remembers it, as a repeated search asks for the same gains."""
+    asked = pick.start, taken.names
+    if asked not in problem.gains:
+        problem.gains[asked] = _gain(problem, pick, taken.rows)
+    return problem.gains[asked]
+
+
+def _gain(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
+    """Compute the gain in double precision: where the projection leaves little of a column, single precision would cause errors of several
+    units in a gain of thousands."""
     projection = problem.projection
     columns = problem.white(pick.raw(problem))
     coordinates, also = projection.coordinates(columns), rows @ columns
@@ -247,15 +263,15 @@ def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:
     return problem.column_cache[name]
 
 
-def rows_for(problem: WhitenedProblem, picks: Sequence[Pick]) -> F2:
-    """Return the rows that project out several picks together, shape (k, n) (`SignalProjection.rows`)."""
+def taken(problem: WhitenedProblem, picks: Sequence[Pick]) -> Taken:
+    """Project out several picks together."""
     if not picks:
-        return np.zeros((0, problem.gap.size))
+        return Taken((), np.zeros((0, problem.gap.size)))
     parts = [whitened(problem, p) for p in picks]
     columns, left = (np.concatenate([p[i] for p in parts], axis=1) for i in (0, 1))
     sd = np.concatenate([p.prior_sd(problem, part[0].shape[1]) for p, part in zip(picks, parts, strict=True)])
     sd = np.minimum(sd, 1.0 / np.sqrt(VISIBLE_SHARE * np.einsum("nk,nk->k", columns, columns) + 1e-300))
-    return rows_of(left, columns, sd)
+    return Taken(tuple(p.start for p in picks), rows_of(left, columns, sd))
 
 
 def with_values(pick: Pick, values: Values) -> Pick:

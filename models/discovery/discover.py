@@ -108,10 +108,11 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     tell = progress or (lambda text, share: None)
     tell("fitting the present simulation", 0.0)
     plain = whiten(case, baseline_of(case))
-    before = predictions(plain, solve(plain, ()))
+    empty = solve(plain, ())
+    before = predictions(plain, empty)
     mixed = mixed_up(plain) or wrong_tool(plain)
     if mixed is not None:
-        return doubted(finding(plain, plain, (), (), solve(plain, ()), (), (before, before)), mixed)
+        return doubted(finding(plain, plain, (), (), empty, (), (before, before)), mixed)
     tell("comparing effects", 0.2)
     problem, contest, found, loud = searched(plain, effects, tell)
     found, rivals = fairly(contest, found)
@@ -123,23 +124,29 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     named = finding(problem, plain, found, loud, solved, rivals, (before, after))
     if named.verdict != "named" or named.p_value < CHANCE:
         return named
-    return replace(named, alone=finding(plain, plain, (), (), solve(plain, ()), (), (before, before)))
+    return replace(named, alone=finding(plain, plain, (), (), empty, (), (before, before)))
 
 
 def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
     """Search for mean and variance effects and refit noise and simulation, up to `ROUNDS` times, until the findings stay the same."""
     contest = Contest.of(problem, effects)
-    found, loud = selected(contest), tuple[VarianceFinding, ...]()
+    found, loud, start = selected(contest), tuple[VarianceFinding, ...](), list[Pick]()
     for i in range(ROUNDS):
         tell("comparing again what is left", 0.5 + 0.15 * i)
         labels = {f.pick.label for f in found} | {f.label for f in loud}
         named = [f.pick for f in found if not f.pick.unnamed]
         loud = _merged(loud, scattered(problem, named))
-        problem = without(settled(problem, [f.pick for f in found]), loud) if i == 0 or labels != _labels(found, loud) else problem
+        if renewed := i == 0 or labels != _labels(found, loud):
+            contest.banks.clear()  # they would take as much memory as those of the new problem
+            problem = without(settled(problem, [f.pick for f in found]), loud)
         if not found and not loud and not any(c.gain for c in problem.colours.values()):
             break
-        contest = Contest.of(problem, effects)
-        found = selected(contest, named)
+        if not renewed and [p.start for p in named] == [p.start for p in start]:
+            break  # the search would only repeat itself
+        again = Contest.of(problem, effects)
+        again.banks.extend(contest.banks[1:])
+        contest, start = again, named
+        found = selected(contest, start)
         if _labels(found, loud) == labels:
             break
     return problem, contest, sorted(found, key=lambda f: -f.score), loud

@@ -23,7 +23,7 @@ from abbe.models.discovery.mixed_up import MixedUp
 from abbe.models.discovery.residues import companions, leaning, residues, shared, ties
 from abbe.models.discovery.selection import EXCLUDED, Rival, Selection, near_waves, u_moment
 from abbe.models.discovery.sensors import exchanged_sensor
-from abbe.models.discovery.solved_model import SolvedModel, left_over, predictions
+from abbe.models.discovery.solved_model import SolvedModel, left_over, shares
 from abbe.models.discovery.unnamed import Structure, describe_structure, lacking, propose_unnamed, structures, wandering
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping
 from abbe.models.discovery.whitened_problem import WhitenedProblem
@@ -154,7 +154,7 @@ def finding(
     case, floor = problem.case, floors(problem)
     calm = np.prod([np.ones(problem.use.size), *(1.0 - creeping(problem.paths, f) for f in loud if f.name == "stick_slip")], axis=0)
     rest = unexplained(problem, [f.pick for f in found], floor, calm)
-    judgement = _judge(problem, found, loud, solved, rivals, rest)
+    judgement = _judge(problem, found, loud, solved, rivals, rest, predicted[1])
     is_named, unnamed = judgement.verdict == "named", judgement.unnamed
     fitted_setups = {r.path.setup for r in problem.runs}
     judged = [r for r in case.runs if r.deviation_mm is not None]
@@ -210,15 +210,16 @@ def _judge(
     solved: SolvedModel,
     rivals: Sequence[Sequence[Rival]],
     rest: float,
+    predicted: Mapping[str, F1],
 ) -> _Judgement:
     """Sort the findings into named effects, structures without a name, and residues of other effects or of unexplained residuals.
 
-    ``rest``: evidence, in nats, of the residuals above the noise that all findings together leave.
+    ``rest``: evidence, in nats, of the residuals above the noise that all findings leave. ``predicted``: readings with findings, by run.
     """
     companion = companions(problem, found, solved)
     uneven, waves = _uneven(problem, found)
     named = [i for i, f in enumerate(found) if not f.pick.unnamed and i not in companion and f.pick.label not in uneven]
-    needed = _needed(problem, solved, named)
+    needed = _needed(problem, solved, named, predicted)
     mean = {i: replace(_named(problem, found[i], solved, i, rivals[i]), needed=needed[i]) for i in named}
     scatter = [_of_scatter(f) for f in loud if not is_unnamed(f.name)]
     names = [*mean.values(), *scatter]
@@ -294,25 +295,22 @@ def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[froze
     return frozenset(labels), tuple(waves)
 
 
-def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int]) -> dict[int, float | None]:
+def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int], predicted: Mapping[str, F1]) -> dict[int, float | None]:
     """Return a ratio for each effect, by index: rms residual of the holdout runs without the effect, over the rms with all effects.
 
-    None without holdout runs (`NamedEffect.needed`).
+    None without holdout runs (`NamedEffect.needed`). ``predicted``: readings with all effects, mm, by run.
     """
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
     if not judges or not which:
         return dict.fromkeys(which)
 
-    def rms(solution: SolvedModel) -> float:
-        read = predictions(problem, solution)
-        return float(np.sqrt(np.nanmean(np.concatenate([left_over(r, read[r.path.label], fitted_setups) for r in judges]) ** 2)))
+    def rms(without: Mapping[str, F1]) -> float:
+        left = (left_over(r, predicted[r.path.label] - without.get(r.path.label, 0.0), fitted_setups) for r in judges)
+        return float(np.sqrt(np.nanmean(np.concatenate([*left]) ** 2)))
 
-    def deficit(i: int) -> SolvedModel:
-        return replace(solved, coefficients=tuple(np.zeros_like(c) if k == i else c for k, c in enumerate(solved.coefficients)))
-
-    whole = rms(solved)
-    return {i: rms(deficit(i)) / whole if whole > 0.0 else None for i in which}
+    whole, parts = rms({}), shares(problem, solved)
+    return {i: rms(parts[i]) / whole if whole > 0.0 else None for i in which}
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:

@@ -67,16 +67,24 @@ class Colour:
 
 def unscaled(columns: F2, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> F2:
     """Whiten columns (n, k) of stacked runs (``lengths``, ``kinds``) as if the noise were 1 mm; the caller divides by the actual noise."""
-    out = np.empty_like(columns)
-    start = 0
-    for n, kind in zip(lengths, kinds, strict=True):
-        m, c, v = colours[kind].filter()
-        part = columns[start : start + n]
-        scale = 1.0 / np.sqrt(v)
-        out[start : start + n] = scipy.signal.lfilter([scale, -m * scale], [1.0, c], part, axis=0)
-        out[start] *= np.sqrt(v)
-        start += n
+    filters = {kind: colours[kind].filter() for kind in set(kinds)}
+    m, c, v = np.repeat([filters[kind] for kind in kinds], lengths, axis=0).T
+    start = np.cumsum(lengths) - lengths
+    m[start], c[start] = 0.0, 0.0  # every run begins anew
+    out = np.divide(columns, np.sqrt(v)[:, None], order="F")
+    out[1:] -= m[1:, None] * out[:-1]
+    out = recursive(out, c)
+    out[start] *= np.sqrt(v[start])[:, None]
     return out
+
+
+def recursive(columns: F2, back: F1) -> F2:
+    """Return y, shape (n, k), with y[t] = columns[t] - back[t] y[t - 1], by LAPACK: `scipy.signal` takes 0.4 s to load."""
+    if not columns.size:
+        return columns
+    band = np.ones((2, len(columns)), order="F")
+    band[1, :-1] = back[1:]
+    return np.asarray(scipy.linalg.lapack.dtbtrs(band, columns, uplo="L", diag="U", overwrite_b=True)[0])
 
 
 def remembered(residual: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> dict[str, Colour]:
@@ -119,9 +127,10 @@ def comes_back(paths: Sequence[Path], residual: Sequence[F1], kind: str) -> bool
 def _as_read(whitened: F1, colour: Colour) -> F1:
     """Undo `unscaled` for one run."""
     m, c, v = colour.filter()
-    first = whitened.copy()
-    first[0] /= np.sqrt(v)
-    return np.asarray(scipy.signal.lfilter([np.sqrt(v), c * np.sqrt(v)], [1.0, -m], first))
+    first = np.sqrt(v) * whitened
+    first[0] = whitened[0]
+    first[1:] += c * first[:-1]
+    return recursive(first[:, None], np.full(len(first), -m))[:, 0]
 
 
 def _likelihood(read: F1, colour: Colour) -> float:

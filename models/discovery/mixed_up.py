@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from itertools import combinations
+from itertools import combinations, islice
 
 import numpy as np
 
@@ -23,6 +23,8 @@ REMAINS = 0.6
 """Readings count as mixed up only if their correction leaves less than this share of the misfit of the whole campaign."""
 ALONE = 0.5
 """Readings count as mixed up only if no correction of other runs explains this share of what the best correction explains."""
+AT_ONCE = 16
+"""Number of corrections tried together; all pairs of 26 runs would take 300 MB."""
 SAME_MM = 0.5
 """Tool vectors that differ by less are one tool; for a component below this size no wrong sign is searched."""
 EXCESS = 0.4
@@ -45,20 +47,22 @@ def mixed_up(problem: WhitenedProblem) -> MixedUp | None:
 
     ``problem``: whitened differences between readings and present simulation, before any search.
     """
-    tried = list(_tried(problem))
+    projection, changes = problem.projection, _tried(problem)
+    tried, left = list[tuple[tuple[str, ...], str]](), list[float]()
+    while some := list(islice(changes, AT_ONCE)):
+        columns = problem.white(np.column_stack([change for _, _, change in some]))
+        y = projection.y[:, None] + columns
+        coordinates = projection.y_coordinates[:, None] + projection.coordinates(columns)
+        left += (((y * y).sum(axis=0) - (coordinates * coordinates).sum(axis=0)) / max(projection.chi2, 1e-300)).tolist()
+        tried += [(runs, how) for runs, how, _ in some]
     if not tried:
         return None
-    projection = problem.projection
-    columns = problem.white(np.column_stack([change for _, _, change in tried]))
-    y = projection.y[:, None] + columns
-    coordinates = projection.y_coordinates[:, None] + projection.coordinates(columns)
-    left = ((y * y).sum(axis=0) - (coordinates * coordinates).sum(axis=0)) / max(projection.chi2, 1e-300)
     best = int(np.argmin(left))
-    runs, how, _ = tried[best]
-    others = [float(v) for v, (names, _, _) in zip(left, tried, strict=True) if not set(names) & set(runs)]
+    runs, how = tried[best]
+    others = [v for v, (names, _) in zip(left, tried, strict=True) if not set(names) & set(runs)]
     if left[best] > REMAINS or 1.0 - min(others, default=1.0) > ALONE * (1.0 - left[best]):
         return None
-    return MixedUp(runs, how, float(left[best]))
+    return MixedUp(runs, how, left[best])
 
 
 def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]]:

@@ -9,7 +9,7 @@ from types import MappingProxyType
 import numpy as np
 
 from abbe.models.discovery.answer import NamedEffect
-from abbe.models.discovery.candidate_bank import Pick, gain_of, rows_for
+from abbe.models.discovery.candidate_bank import Pick, gain_of, taken
 from abbe.models.discovery.selection import Selection
 from abbe.models.discovery.solved_model import SolvedModel
 from abbe.models.discovery.whitened_problem import WhitenedProblem
@@ -54,7 +54,7 @@ def shared(problem: WhitenedProblem, found: Sequence[Selection]) -> dict[tuple[s
     for other in found:
         rest = [f for f in found if f is not other]
         for f in rest:
-            gain = gain_of(problem, f.pick, rows_for(problem, [g.pick for g in rest if g is not f]))
+            gain = gain_of(problem, f.pick, taken(problem, [g.pick for g in rest if g is not f]))
             out[f.pick.label, other.pick.label] = 0.5 * (gain - (f.gain - f.score))
     return out
 
@@ -155,7 +155,7 @@ def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[s
 
 def _scores(problem: WhitenedProblem, f: Selection, beside: Sequence[Pick]) -> bool:
     """Whether a finding gains more than its price beside other picks."""
-    return gain_of(problem, f.pick, rows_for(problem, beside)) > f.gain - f.score
+    return gain_of(problem, f.pick, taken(problem, beside)) > f.gain - f.score
 
 
 def companions(problem: WhitenedProblem, found: Sequence[Selection], solved: SolvedModel) -> dict[int, int]:

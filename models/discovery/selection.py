@@ -14,8 +14,7 @@ from itertools import combinations, pairwise
 import numpy as np
 import scipy
 
-from abbe.models.arrays import F2
-from abbe.models.discovery.candidate_bank import UNNAMED, Bank, Pick, bank_of, competing, gain_of, rows_for, starts_of, with_values
+from abbe.models.discovery.candidate_bank import UNNAMED, Bank, Pick, Taken, bank_of, competing, gain_of, starts_of, taken, with_values
 from abbe.models.discovery.generic.unnamed_structures import generic_rivals
 from abbe.models.discovery.whitened_problem import WhitenedProblem
 from abbe.models.effects.effect import Effect, Parameter, Signal
@@ -58,19 +57,19 @@ KIN = 0.02
 """Rivals that explain all but this share of the gain are not excluded, because a real effect deviates that much from its formula."""
 
 
-def refined(problem: WhitenedProblem, pick: Pick, rows: F2, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
+def refined(problem: WhitenedProblem, pick: Pick, beside: Taken, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
     """Optimise the non-linear parameters of ``pick`` one after the other; return the pick and its gain.
 
     Each parameter stays between the neighbouring starts, and close to its start (`NEAR`) in a structure without a name. A parameter of a
     name that the readings do not determine takes its usual value (`Parameter.prior_sd`).
     """
-    best = gain_of(problem, pick, rows)
+    best = gain_of(problem, pick, beside)
     if not pick.effect.shape:
         return pick, best
     for sweep in range(sweeps if len(pick.effect.shape) > 1 else 1):
         before = best
         for parameter in pick.effect.shape:
-            pick, best = _along(parameter, pick, best, lambda p: gain_of(problem, p, rows), shrink=0.5**sweep)
+            pick, best = _along(parameter, pick, best, lambda p: gain_of(problem, p, beside), shrink=0.5**sweep)
         if best - before < 0.3:
             break
     return pick, best
@@ -166,13 +165,13 @@ class Contest:
         seconds = tuple(e for e in rivals if e.beside)
         return cls(problem, [bank], widths, len(widths) + UNNAMED_LABELS, int(np.count_nonzero(problem.use)), seconds)
 
-    def look_for_more(self, picks: Sequence[Pick], rows: F2) -> None:
+    def look_for_more(self, picks: Sequence[Pick], beside: Taken) -> None:
         """Add to the search the effects that are tried only together with ``picks``, and structures without a name.
 
-        These structures start at the peaks of the residuals after projection by ``rows``, which project out the picks.
+        These structures start at the peaks of the residuals once the picks are projected out (``beside``).
         """
         problem = self.problem
-        left = problem.projection.residual - rows.T @ (rows @ problem.projection.y)
+        left = problem.projection.residual - beside.rows.T @ (beside.rows @ problem.projection.y)
         labels = [p.label for p in problem.paths]
         sigma = {kind: c.sd_mm for kind, c in problem.colours.items()}
         rivals = generic_rivals(problem.case, dict(zip(labels, problem.by_run(left), strict=True)), sigma)
@@ -196,23 +195,23 @@ class Contest:
             self.widths[name] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())
         return self.widths[name]
 
-    def shortlist(self, rows: F2, without: Sequence[str], most: int = SHORTLIST) -> list[Selection]:
+    def shortlist(self, beside: Taken, without: Sequence[str], most: int = SHORTLIST) -> list[Selection]:
         """Return the best candidate of each label on the grid, best labels first; labels in ``without`` are left out."""
         best: dict[str, Selection] = {}
         for bank in self.banks:
-            for pick, gain in zip(bank.picks, bank.gains(self.problem.projection.y, rows), strict=True):
+            for pick, gain in zip(bank.picks, bank.gains(self.problem.projection.y, beside.rows), strict=True):
                 if pick.label not in without and (pick.label not in best or gain > best[pick.label].gain):
                     best[pick.label] = Selection(pick, float(gain), float(gain) - self.price(pick))
         return sorted(best.values(), key=lambda f: (-f.score, f.pick.label))[:most]
 
-    def next(self, picks: Sequence[Pick], rows: F2, without: Sequence[str] = (), beat: float = 0.0) -> Selection | None:
+    def next(self, picks: Sequence[Pick], beside: Taken, without: Sequence[str] = (), beat: float = 0.0) -> Selection | None:
         """Return the best refined new label with a score above ``beat``, or None; a name nearly as good wins over an unnamed structure."""
         tried: list[Selection] = []
-        for candidate in self.shortlist(rows, [*without, *(p.label for p in picks)]):
+        for candidate in self.shortlist(beside, [*without, *(p.label for p in picks)]):
             most = max([beat, *(f.score for f in tried)])
             if candidate.gain < HOPELESS * most - 20.0 or candidate.score < -30.0:
                 continue
-            pick, gain = refined(self.problem, candidate.pick, rows)
+            pick, gain = refined(self.problem, candidate.pick, beside)
             tried.append(Selection(pick, gain, gain - self.price(pick)))
         good = [f for f in tried if f.score > beat]
         if not good:
@@ -223,7 +222,7 @@ class Contest:
             return max(near, key=lambda f: f.score, default=best)
         return best
 
-    def next_form(self, picks: Sequence[Pick], rows: F2) -> tuple[int, Pick, float] | None:
+    def next_form(self, picks: Sequence[Pick], beside: Taken) -> tuple[int, Pick, float] | None:
         """Find the best form (`Form`) to add to a chosen effect; return the index of the pick, the pick with the form, and its score."""
         best: tuple[int, Pick, float] | None = None
         for i, pick in enumerate(picks):
@@ -231,8 +230,8 @@ class Contest:
                 if form in pick.forms:
                     continue
                 more = replace(pick, forms=(*pick.forms, form))
-                only = replace(pick.effect, name=UNNAMED + "form", signal=form.signal, forms=())
-                gain = gain_of(self.problem, Pick(only, pick.key, pick.values), rows)
+                only = replace(pick.effect, name=f"{UNNAMED}form {pick.effect.name} {form.name}", signal=form.signal, forms=())
+                gain = gain_of(self.problem, Pick(only, pick.key, pick.values), beside)
                 score = gain - form_price(self._form_width(more, len(more.forms) - 1))
                 if gain < FORM_LEAST * gain_of(self.problem, pick, others(self.problem, picks, i)):
                     continue
@@ -270,10 +269,10 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
     """Select all effects that are worth their price, with backward steps after every addition."""
     picks, problem, in_vain = list(start), contest.problem, list[str]()
     for _ in range(3 * most):
-        rows = rows_for(problem, picks)
-        form = contest.next_form(picks, rows)
-        contest.look_for_more(picks, rows)
-        new = contest.next(picks, rows, in_vain) if len(picks) < most else None
+        beside = taken(problem, picks)
+        form = contest.next_form(picks, beside)
+        contest.look_for_more(picks, beside)
+        new = contest.next(picks, beside, in_vain) if len(picks) < most else None
         if form is not None and (new is None or form[2] > new.score or form[2] > 0.5 * new.score):
             picks[form[0]] = form[1]
         elif new is not None:
@@ -288,9 +287,9 @@ def selected(contest: Contest, start: Sequence[Pick] = (), most: int = MOST_EFFE
     return weighed(contest, dropped(contest, picks))
 
 
-def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> F2:
-    """Return the rows that project out all picks but number i."""
-    return rows_for(problem, [p for j, p in enumerate(picks) if j != i])
+def others(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> Taken:
+    """Project out all picks but number i."""
+    return taken(problem, [p for j, p in enumerate(picks) if j != i])
 
 
 def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
@@ -298,10 +297,10 @@ def swapped(contest: Contest, picks: list[Pick]) -> list[Pick]:
     if len(picks) < 2:
         return picks
     for i in range(len(picks)):
-        rows = others(contest.problem, picks, i)
-        own, gain = refined(contest.problem, picks[i], rows, sweeps=1)
+        beside = others(contest.problem, picks, i)
+        own, gain = refined(contest.problem, picks[i], beside, sweeps=1)
         score = gain - contest.price(own)
-        rival = contest.next([p for j, p in enumerate(picks) if j != i], rows, without=[picks[i].label], beat=score + 1.0)
+        rival = contest.next([p for j, p in enumerate(picks) if j != i], beside, without=[picks[i].label], beat=score + 1.0)
         picks[i] = own if rival is None else rival.pick
     return picks
 
@@ -319,29 +318,29 @@ def merged(contest: Contest, picks: list[Pick]) -> list[Pick]:
         if a.unnamed and b.unnamed:
             continue
         rest = [p for k, p in enumerate(picks) if k not in (i, j)]
-        rows = rows_for(problem, rest)
-        both = gain_of(problem, a, rows) + gain_of(problem, b, rows_for(problem, [*rest, a]))
+        beside = taken(problem, rest)
+        both = gain_of(problem, a, beside) + gain_of(problem, b, taken(problem, [*rest, a]))
         worth = both - contest.price(a) - contest.price(b)
-        near = [f for f in contest.shortlist(rows, [p.label for p in rest], TRIED) if f.gain > LIKE * both]
-        tried = [_formed_twice(contest, f.pick, rows, worth) for f in near if not f.pick.unnamed and not f.pick.effect.beside]
+        near = [f for f in contest.shortlist(beside, [p.label for p in rest], TRIED) if f.gain > LIKE * both]
+        tried = [_formed_twice(contest, f.pick, beside, worth) for f in near if not f.pick.unnamed and not f.pick.effect.beside]
         best = max(tried, key=lambda t: t[0], default=None)
         if best is not None and best[0] > worth:
             return merged(contest, [*rest, best[1]])
     return picks
 
 
-def _formed_twice(contest: Contest, pick: Pick, rows: F2, worth: float) -> tuple[float, Pick]:
+def _formed_twice(contest: Contest, pick: Pick, beside: Taken, worth: float) -> tuple[float, Pick]:
     """Refine a pick, add its forms, and refine it again, because the forms move the best pitch or time constant; return score and pick.
 
     A pick without non-linear parameters stays without forms if not even all forms together make its score larger than ``worth``.
     """
-    one, gain = refined(contest.problem, pick, rows)
+    one, gain = refined(contest.problem, pick, beside)
     score = gain - contest.price(one)
-    if not one.effect.shape and gain_of(contest.problem, replace(one, forms=one.effect.forms), rows) - gain + score <= worth:
+    if not one.effect.shape and gain_of(contest.problem, replace(one, forms=one.effect.forms), beside) - gain + score <= worth:
         return score, one
-    one, gain, score = _formed(contest, one, rows, gain)
+    one, gain, score = _formed(contest, one, beside, gain)
     if one.forms and one.effect.shape:
-        one, gain = refined(contest.problem, one, rows, sweeps=1)
+        one, gain = refined(contest.problem, one, beside, sweeps=1)
         score = gain - contest.price(one)
     return score, one
 
@@ -383,9 +382,9 @@ def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
 
     `UNSURE`: largest loss of gain that counts as nearly as much. A step in time has no derivative, so the fit gives no uncertainty.
     """
-    rows, pick = others(problem, picks, i), picks[i]
+    beside, pick = others(problem, picks, i), picks[i]
     times = np.array([*moments(problem.paths), pick.values["t0_s"]])
-    gains = np.array([gain_of(problem, with_values(pick, {**pick.values, "t0_s": float(t)}), rows) for t in times])
+    gains = np.array([gain_of(problem, with_values(pick, {**pick.values, "t0_s": float(t)}), beside) for t in times])
     near = times[gains > gains.max() - UNSURE]
     gap = np.diff(np.sort(times))[max(int(np.searchsorted(np.sort(times), pick.values["t0_s"])) - 1, 0)]
     return float(max(0.25 * np.ptp(near), gap / np.sqrt(12.0)))
@@ -403,15 +402,15 @@ class Rival:
 def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Rival]:
     """Return the rivals of pick ``i`` that the readings do not exclude, best first, without variants of its name."""
     picks = [f.pick for f in found]
-    rows = others(contest.problem, picks, i)
+    beside = others(contest.problem, picks, i)
     own = found[i]
     without = [p.label for p in picks]
     out = []
-    for candidate in contest.shortlist(rows, without, TRIED):
+    for candidate in contest.shortlist(beside, without, TRIED):
         if candidate.pick.unnamed or _nested(candidate.pick, own.pick) or candidate.gain < LIKE * own.gain:
             continue
-        pick, gain = refined(contest.problem, candidate.pick, rows)
-        pick, gain, score = _formed(contest, pick, rows, gain)
+        pick, gain = refined(contest.problem, candidate.pick, beside)
+        pick, gain, score = _formed(contest, pick, beside, gain)
         rival = Rival(pick, own.score - score, gain / own.gain)
         if rival.deficit < EXCLUDED or rival.share > 1.0 - KIN:
             out.append(rival)
@@ -423,12 +422,12 @@ def _nested(a: Pick, b: Pick) -> bool:
     return a.key == b.key and (a.effect.name == b.effect.variant_of or b.effect.name == a.effect.variant_of)
 
 
-def _formed(contest: Contest, pick: Pick, rows: F2, gain: float) -> tuple[Pick, float, float]:
+def _formed(contest: Contest, pick: Pick, beside: Taken, gain: float) -> tuple[Pick, float, float]:
     """Add the forms (`Form`) that are worth their price to a rival; return it with gain and score."""
     score = gain - contest.price(pick)
     for form in pick.effect.forms:
         more = replace(pick, forms=(*pick.forms, form))
-        with_form = gain_of(contest.problem, more, rows)
+        with_form = gain_of(contest.problem, more, beside)
         if with_form - gain < FORM_LEAST * gain:  # the same rule as for the chosen name
             continue
         if with_form - contest.price(more) > score:

@@ -14,6 +14,7 @@ from abbe.models.discovery.candidate_bank import Pick, with_values
 from abbe.models.discovery.case import CaseRun
 from abbe.models.discovery.whitened_problem import WhitenedProblem, ordered
 from abbe.models.effects.effect import Signal
+from abbe.models.effects.path import Together
 
 STEPS = 2
 LONGEST_STEP = 0.3
@@ -102,7 +103,7 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
     base, n, tangent, sd_mm = problem.base, problem.base.size, problem.tangent, problem.sd_mm()[:, None]
     white = problem.white(np.column_stack([problem.gap + tangent.raw @ problem.theta, *raw]))
     more = white[:, 1:]
-    cross = tangent.columns.T @ (white / sd_mm)
+    cross = ((white / sd_mm).T @ tangent.columns).T
     gram = np.block([[tangent.blend(problem.colours), cross[:, 1:]], [cross[:, 1:].T, more.T @ more]])
     root = scipy.linalg.block_diag(base.root, *(np.diag(s) for s in sd))
     gram = root.T @ gram @ root
@@ -117,20 +118,31 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
 
 def predictions(problem: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
     """Predict the readings of every run, sealed runs included, mm; set-up unknowns that no identify run determines are zero."""
+    parts = shares(problem, solved)
+    return {
+        r.path.label: np.sum([problem.base.read(r.data(), solved.theta), *(part[r.path.label] for part in parts)], axis=0)
+        for r in ordered(problem.case.runs)
+    }
+
+
+def shares(problem: WhitenedProblem, solved: SolvedModel) -> list[dict[str, F1]]:
+    """Return the part of each pick in the predicted readings of every run, mm, by label of the run."""
+    if not solved.picks:
+        return []
     runs = ordered(problem.case.runs)
-    data = [r.data() for r in runs]
-    out = [problem.base.read(d, solved.theta) for d in data]
-    paths = tuple(problem.base.along(r.path, d, solved.theta) for r, d in zip(runs, data, strict=True))
+    paths = Together(problem.base.along(r.path, r.data(), solved.theta) for r in runs)
     identified = tuple(r.path.label in {p.label for p in problem.paths} for r in runs)
+    out = []
     for pick, c in zip(solved.picks, solved.coefficients, strict=True):
-        used = 0
+        used, total = 0, [np.zeros(p.n) for p in paths]
         for signal in (pick.effect.signal, *(f.signal for f in pick.forms)):
             columns = signal(paths, pick.key, pick.values)
             width = _width(signal, problem, pick)
             part = _spread(columns, identified, c[used : used + width])
             used += width
-            out = [o + col @ part for o, col in zip(out, columns, strict=True)]
-    return {r.path.label: o for r, o in zip(runs, out, strict=True)}
+            total = [t + col @ part for t, col in zip(total, columns, strict=True)]
+        out.append({p.label: t for p, t in zip(paths, total, strict=True)})
+    return out
 
 
 def _width(signal: Signal, problem: WhitenedProblem, pick: Pick) -> int:

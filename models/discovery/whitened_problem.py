@@ -19,7 +19,7 @@ from abbe.models.discovery.baseline import Baseline
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.instrument_noise import Colour, beside_turns, comes_back, level, lone, remembered, unscaled
 from abbe.models.effects.effect import Signal, Values
-from abbe.models.effects.path import Path
+from abbe.models.effects.path import Path, Together
 
 ROWS = 2048
 """Readings per block of a product, to save memory."""
@@ -77,7 +77,7 @@ class SignalProjection:
 
     def coordinates(self, columns: F2) -> F2:
         """Apply T of the class to columns (n, q): return T @ columns, shape (p + k, q)."""
-        return np.concatenate([self.root @ (self.columns.T @ (columns * self.weight[:, None])), self.more @ columns])
+        return np.concatenate([self.root @ ((columns * self.weight[:, None]).T @ self.columns).T, self.more @ columns])
 
     def spread(self, amounts: F2) -> F2:
         """Apply the transpose of T to amounts (p + k, q): return T^T @ amounts, shape (n, q)."""
@@ -137,8 +137,8 @@ class WhitenedProblem:
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
     also : array, shape (n, k): further columns, projected out together with the simulation's (waves of a vibration), mm per mm.
-    column_cache : whitened columns of picks and their projection. banks : banks of candidates of this problem that are still in
-        memory. widths : number of columns of an effect along one run, by label. All three are caches.
+    column_cache : whitened columns of picks and their projection. gains : gain of a pick beside others. banks : banks of candidates of
+        this problem that are still in memory. widths : number of columns of an effect along one run, by label. All four are caches.
     """
 
     case: Case
@@ -153,22 +153,25 @@ class WhitenedProblem:
     projection: SignalProjection
     also: F2
     column_cache: dict[str, tuple[F2, F2]] = field(default_factory=dict)
+    gains: dict[tuple[str, tuple[str, ...]], float] = field(default_factory=dict)
     banks: WeakSet[object] = field(default_factory=WeakSet)
     widths: dict[str, int] = field(default_factory=dict)
 
-    @property
+    @cached_property
     def lengths(self) -> tuple[int, ...]:
         """Readings per run."""
         return tuple(p.n for p in self.paths)
 
-    @property
+    @cached_property
     def kinds(self) -> tuple[str, ...]:
         """Instrument of every run."""
         return tuple(p.kind for p in self.paths)
 
     def white(self, columns: F2) -> F2:
         """Whiten columns (n, k), mm, to unit noise; readings that do not count become zero."""
-        return unscaled(columns * self.use[:, None], self.lengths, self.kinds, self.colours) / self.sd_mm()[:, None]
+        out = unscaled(columns * self.use[:, None], self.lengths, self.kinds, self.colours)
+        out /= self.sd_mm()[:, None]
+        return out
 
     def raw(self, signal: Signal, key: str, values: Values) -> F2:
         """Columns of an effect over all runs, mm, shape (n, k)."""
@@ -225,7 +228,7 @@ class Tangent:
     def of(cls, raw: Slopes, use: F1, lengths: Sequence[int], kinds: Sequence[str], colours: Mapping[str, Colour]) -> Tangent:
         """Whiten ``raw`` and build the Gram matrices run by run, to hold no more than one large matrix besides ``raw``."""
         n, p = raw.short.shape
-        columns = np.empty((n, p))
+        columns = np.empty((n, p), order="F")
         gram = {kind: np.zeros((p, p)) for kind in dict.fromkeys(kinds)}
         start = 0
         for length, kind in zip(lengths, kinds, strict=True):
@@ -250,7 +253,7 @@ def whiten(case: Case, base: Baseline) -> WhitenedProblem:
     """Build the problem of a case: fit the present simulation to the identify runs, estimate noise and project the unknowns out."""
     runs = ordered(case.of("identify"))
     use = np.concatenate([r.valid.astype(float) for r in runs])
-    paths, n = tuple(r.path for r in runs), use.size
+    paths, n = Together(r.path for r in runs), use.size
     tangent = Tangent.of(Slopes.of(runs, base), use, [p.n for p in paths], [p.kind for p in paths], FIRST_NOISE)
     problem = WhitenedProblem(
         case, base, runs, paths, np.zeros(n), use, np.zeros(base.size), FIRST_NOISE, tangent, SignalProjection.nothing(n), np.zeros((n, 0))
@@ -268,7 +271,7 @@ def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedPro
     sd_mm = problem.sd_mm()[:, None]
     white = problem.white(np.column_stack([problem.gap + tangent.raw @ problem.theta, extra]))
     y, more = white[:, 0], white[:, 1:]
-    cross = (tangent.columns.T @ (white / sd_mm)).T
+    cross = (white / sd_mm).T @ tangent.columns
     gram = np.block([[tangent.blend(problem.colours), cross[1:].T], [cross[1:], more.T @ more]])
     sd = np.concatenate([base.prior_sd * FITTED, extra_sd])
     gram = gram * sd[:, None] * sd
@@ -276,10 +279,10 @@ def linearised(problem: WhitenedProblem, extra: F2, extra_sd: F1) -> WhitenedPro
     solution = sd * np.linalg.solve(gram, sd * np.concatenate([cross[0], more.T @ y]))
     theta = solution[: base.size]
     value = np.concatenate([base.read(d, theta) for d in data])
-    paths = tuple(base.along(r.path, d, theta) for r, d in zip(problem.runs, data, strict=True))
+    paths = Together(base.along(r.path, d, theta) for r, d in zip(problem.runs, data, strict=True))
     gap = np.concatenate([d.deviation_mm for d in data]) - value
     problem.column_cache.clear()  # the old problem's cache would take as much memory again
-    return replace(problem, theta=theta, gap=gap, paths=paths, column_cache={}, banks=WeakSet())
+    return replace(problem, theta=theta, gap=gap, paths=paths, column_cache={}, gains={}, banks=WeakSet())
 
 
 def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
@@ -292,7 +295,7 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
     )
     if problem.also.shape[1]:
         projection = projection.without(problem.white(problem.also), np.full(problem.also.shape[1], LOUDEST_MM))
-    return replace(problem, projection=projection, column_cache={}, banks=WeakSet())
+    return replace(problem, projection=projection, column_cache={}, gains={}, banks=WeakSet())
 
 
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]], *, memory: bool = False) -> WhitenedProblem:

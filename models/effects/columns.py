@@ -91,6 +91,11 @@ def of_path(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
     return signal
 
 
+def of_strokes(deviation: Callable[[Path, Places, str, Values], F3]) -> Signal:
+    """Do the same as `of_places` for a deviation that also depends on the strokes or the vertical axis, which all runs share."""
+    return lambda paths, key, values: read_together(paths, lambda at: deviation(paths[0], at, key, values))
+
+
 def of_body(deviation: Callable[[Path, Places, str, Values], F3], turn: Callable[[Path, Places, str, Values], F3]) -> Signal:
     """Do the same as `of_path` for a body that turns, and add the reading from the plane mirror that turns with it.
 
@@ -269,7 +274,7 @@ def shifts(direction: Callable[[str], int], first: int, last: int) -> Signal:
         a = axis_of(key)
         return along(direction(key), *(UM * smooth(at.q_mm[:, a], path.machine.stroke_mm[a], first, last)).T)
 
-    return of_path(moved)
+    return of_strokes(moved)
 
 
 def finer_shifts(direction: Callable[[str], int]) -> tuple[Form, ...]:

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.geometry.chain import REST_MM, travel_sign
@@ -131,15 +132,25 @@ class Path:
         return np.asarray(np.einsum("ni,nik->nk", self.look, deviation(self.at) - deviation(self.reference)))
 
 
+class Together(tuple[Path, ...]):
+    """Runs of a search, which reads hundreds of deviations along them: their places are joined once."""
+
+    @cached_property
+    def joined(self) -> tuple[Places, F2, NDArray[np.intp]]:
+        """Places of all readings and then of all references; ``look``, shape (n, 3); readings per run."""
+        places = _joined([*(p.at for p in self), *(p.reference for p in self)])
+        return places, np.concatenate([p.look for p in self]), np.array([p.n for p in self])
+
+
 def read_together(paths: Sequence[Path], deviation: Callable[[Places], F3]) -> list[F2]:
     """Return `Path.read` of all runs at once, for a deviation that treats each row of `Places` alone and uses no temperature."""
     if not paths:
         return []
-    found = deviation(_joined([*(p.at for p in paths), *(p.reference for p in paths)]))
-    n = [p.n for p in paths]
-    zero = np.repeat(found[sum(n) :], n, axis=0)
-    reading = np.einsum("ni,nik->nk", np.concatenate([p.look for p in paths]), found[: sum(n)] - zero)
-    return np.split(reading, np.cumsum(n)[:-1])
+    at, look, n = (paths if isinstance(paths, Together) else Together(paths)).joined
+    found = deviation(at)
+    zero = np.repeat(found[len(look) :], n, axis=0)
+    columns = np.einsum("ni,nik->nk", look, found[: len(look)] - zero)
+    return [columns[end - size : end] for end, size in zip(np.cumsum(n).tolist(), n.tolist(), strict=True)]
 
 
 def _joined(parts: Sequence[Places]) -> Places:

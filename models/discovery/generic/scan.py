@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
 from abbe.models.effects.path import Path
@@ -134,12 +135,20 @@ def bursts(scanned: ScanResult, count: int) -> tuple[tuple[float, ...], tuple[fl
             if not f.size or len(lag) > p.n:
                 continue
             swing = np.exp(2j * np.pi * f[:, None] * lag)
-            power = np.abs(scipy.signal.fftconvolve(np.broadcast_to(rest, (len(f), p.n)), window * swing, mode="same", axes=1)) ** 2
+            power = np.abs(_convolved(rest, window * swing)) ** 2
             power /= 0.5 * float(np.sum(window**2))
             k, i = np.unravel_index(int(np.argmax(power)), power.shape)
             found.append((float(power[k, i]), float(p.at.t_s[i]), width, float(f[k])))
     top = sorted(found, reverse=True)[:count]
     return tuple(tuple(dict.fromkeys(round(v[j], 6) for v in top)) for j in (1, 2, 3))  # type: ignore[return-value]
+
+
+def _convolved(rest: F1, kernels: NDArray[np.complex128]) -> NDArray[np.complex128]:
+    """Convolve readings (n,) with kernels (m, k), k odd, about their middles, shape (m, n); `scipy.signal` takes long to load."""
+    n, k = rest.size, kernels.shape[1]
+    size = scipy.fft.next_fast_len(n + k - 1)
+    full = scipy.fft.ifft(scipy.fft.fft(rest, size) * scipy.fft.fft(kernels, size), overwrite_x=True)
+    return np.asarray(full[:, k // 2 : k // 2 + n])
 
 
 def bumps(scanned: ScanResult, widths_mm: tuple[float, ...], count: int) -> tuple[float, ...]:

@@ -49,16 +49,16 @@ Starts = dict[str, dict[str, tuple[float, ...]]]
 
 def smooth(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """Return columns of a smooth deviation: for ``"EYX"`` in direction Y as a function of X, Legendre orders 2 to 6 over the stroke."""
-    return [p.read(lambda at, p=p: _along(key[1], _orders(p, at, key[2], SMOOTH_ORDERS))) for p in paths]  # type: ignore[misc]
+    return read_together(paths, lambda at: _along(key[1], _orders(paths[0], at, key[2], SMOOTH_ORDERS)))
 
 
 def odd(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """Return columns as `smooth` does, but of orders 1 to 3 and multiplied by the direction in which the axis last moved."""
 
-    def deviation(p: Path, at: Places) -> F3:
-        return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(p, at, key[2], ODD_ORDERS))
+    def deviation(at: Places) -> F3:
+        return _along(key[1], at.sign[:, AXES.index(key[2]), None] * _orders(paths[0], at, key[2], ODD_ORDERS))
 
-    return [p.read(lambda at, p=p: deviation(p, at)) for p in paths]  # type: ignore[misc]
+    return read_together(paths, deviation)
 
 
 def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_path, of_places, share_of_stroke
+from abbe.models.effects.columns import AXIS_KEYS, UM, VISITED, along, amplitude, axis_of, of_places, of_strokes, share_of_stroke
 from abbe.models.effects.effect import Effect, Form, Parameter, Signal, Values
 from abbe.models.effects.path import Path, Places
 
@@ -69,8 +69,8 @@ EFFECT = Effect(
         Form("second harmonic", of_places(_second)),
         Form("harmonics 3 to 6", _harmonics(3, 6)),
         Form("harmonics 7 to 14", _harmonics(7, 14)),
-        Form("modulated", of_path(_modulated)),
-        Form("modulated twice", of_path(_modulated_twice)),
+        Form("modulated", of_strokes(_modulated)),
+        Form("modulated twice", of_strokes(_modulated_twice)),
     ),
     needs="at least four readings per pitch along the axis; a laser step that is not a multiple of the pitch",
     signature="a chirp on the circle: fast across the axis, slow near its reversals, the same in both directions",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_path, share_of_stroke, third_axis
+from abbe.models.effects.columns import LATERAL_KEYS, UM, along, axis_of, direction_of, first, of_strokes, share_of_stroke, third_axis
 from abbe.models.effects.effect import Effect, Form, Values
 from abbe.models.effects.path import Path, Places
 
@@ -43,9 +43,9 @@ EFFECT = Effect(
     per_unit=1.0,
     typical=(2.0, 20.0),
     shape=(),
-    signal=of_path(twisted),
+    signal=of_strokes(twisted),
     strength=first,
-    forms=(Form("double bow", of_path(_double_bow)), Form("curved across", of_path(_curved_across))),
+    forms=(Form("double bow", of_strokes(_double_bow)), Form("curved across", of_strokes(_curved_across))),
     needs="at least two origins on the other axis and laser diagonals; a model with 21 error motions absorbs most of it",
     signature="the straightness of an axis changes its sign from one side of the table to the other",
     remedy="mechanics",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, STEEL_PER_K, along, axis_of, first, of_path, warmth, with_sensor
+from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, STEEL_PER_K, along, axis_of, first, of_strokes, warmth, with_sensor
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
@@ -55,11 +55,11 @@ EFFECT = Effect(
     per_unit=1.0,
     typical=(1.0, 8.0),
     shape=SHAPE,
-    signal=of_path(growth),
+    signal=of_strokes(growth),
     strength=first,
     forms=(
-        Form("second time constant", of_path(_second_time)),
-        Form("uneven", of_path(_uneven)),
+        Form("second time constant", of_strokes(_second_time)),
+        Form("uneven", of_strokes(_uneven)),
         Form("sensor", with_sensor(_sensed, str.lower)),
     ),
     needs="an early run repeated late; two origins on the axis",

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import Bank, bank_of, gain_of, rows_for, starts_of
+from abbe.models.discovery.candidate_bank import Bank, bank_of, gain_of, starts_of, taken
 from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten, with_projection
 from abbe.models.effects.catalogue import CATALOGUE
 from tests.models.discovery.test_discovery_search import campaign
@@ -37,11 +37,11 @@ def test_gains_of_a_bank_are_those_of_each_pick_alone(problem: WhitenedProblem) 
     bank = bank_of(problem, PICKS)
     assert len(bank.parts) > 1
     assert {p.effect.name for p in bank.picks} == {"backlash", "cyclic_error", "lateral_play"}
-    for rows in (rows_for(problem, []), rows_for(problem, [PICKS[0]])):
-        gains = bank.gains(problem.projection.y, rows)
-        alone = np.array([gain_of(problem, p, rows) for p in bank.picks])
+    for beside in (taken(problem, []), taken(problem, [PICKS[0]])):
+        gains = bank.gains(problem.projection.y, beside.rows)
+        alone = np.array([gain_of(problem, p, beside) for p in bank.picks])
         assert gains == pytest.approx(alone, rel=1e-4, abs=1e-3)
-    assert gain_of(problem, PICKS[0], rows_for(problem, [])) > 100.0
+    assert gain_of(problem, PICKS[0], taken(problem, [])) > 100.0
 
 
 def test_what_another_bank_holds_is_not_made_again_and_is_the_same(problem: WhitenedProblem, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -71,3 +71,13 @@ def test_a_pick_that_is_asked_for_twice_is_held_once(problem: WhitenedProblem) -
     twice, once = (bank_of(problem, picks) for picks in ([*PICKS[:5], *PICKS[:3]], PICKS[:5]))
     same(twice, once)
     assert list(bank_of(problem, PICKS[1:4]).known) == [p.start for p in PICKS[1:4]]  # taken over from those
+
+
+def test_a_gain_is_computed_once_and_not_for_another_problem(problem: WhitenedProblem, monkeypatch: pytest.MonkeyPatch) -> None:
+    beside = taken(problem, [PICKS[0]])
+    gains = [gain_of(problem, p, beside) for p in PICKS[1:4]]
+    alone = gain_of(problem, PICKS[1], taken(problem, []))
+    assert alone != gains[0]  # the same pick beside others is another question
+    assert not with_projection(problem).gains
+    monkeypatch.setattr(WhitenedProblem, "white", None)  # nothing is whitened a second time
+    assert [gain_of(problem, p, beside) for p in PICKS[1:4]] == gains

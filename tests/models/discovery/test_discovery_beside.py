@@ -10,7 +10,7 @@ import pytest
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import Pick, rows_for
+from abbe.models.discovery.candidate_bank import Pick, taken
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.instrument_noise import fine
@@ -62,7 +62,7 @@ def test_a_wave_and_its_double_pitch_are_one_wave_with_harmonics() -> None:
     assert (wave.label, [f.name for f in wave.forms]) == ("cyclic_error:X", ["second harmonic"])
     assert wave.values["pitch_mm"] == pytest.approx(20.0, rel=1e-3)
     only_second = Contest.of(problem, [e for e in WAVES if e.name != "cyclic_error"])
-    only_second.look_for_more([short], rows_for(problem, [short]))
+    only_second.look_for_more([short], taken(problem, [short]))
     assert merged(only_second, [short, long]) == [short, long]  # a second wave needs a first one
 
 

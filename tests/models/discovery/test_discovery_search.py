@@ -12,7 +12,7 @@ import pytest
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import gain_of, rows_for
+from abbe.models.discovery.candidate_bank import gain_of, taken
 from abbe.models.discovery.case import Case, CaseRun, Role
 from abbe.models.discovery.discover import discover, fairly
 from abbe.models.discovery.instrument_noise import Colour, unscaled
@@ -142,7 +142,7 @@ def test_the_better_of_two_names_stands_once_both_may_bend() -> None:
     case, _ = of_backlash()
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 12)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 12)}
     found, rivals = fairly(contest, weighed(contest, [by["servo_mismatch:X"]]))
     assert [f.pick.label for f in found] == ["backlash:X"]
     assert len(rivals) == 1
@@ -153,7 +153,7 @@ def test_two_axes_that_lead_give_way_to_the_one_that_trails() -> None:
     case = campaign(late_ms=0.2)
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 40)}
     lead = [by["servo_mismatch:X"], by["servo_mismatch:Z"]]
     assert [p.label for p in merged(contest, lead)] == ["servo_mismatch:Y"]
     idle = [by["servo_mismatch:Y"], by["backlash:X"]]
@@ -164,7 +164,7 @@ def test_two_names_that_both_explain_something_both_stay() -> None:
     case = campaign(backlash_um=4.0, late_ms=0.2)
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 40)}
     both = [by["servo_mismatch:Y"], by["backlash:X"]]
     assert merged(contest, both) == both
 
@@ -173,7 +173,7 @@ def test_a_name_that_explains_nothing_without_a_residue_goes_with_the_residue() 
     case, _ = of_backlash()
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 40)}
     (true,) = weighed(contest, [by["backlash:X"]])
     spoilt = Selection(by["servo_mismatch:X"], gain=500.0, score=450.0)
     repair = Selection(by["servo_mismatch:Z"], gain=300.0, score=250.0)
@@ -187,9 +187,9 @@ def test_a_lone_name_that_leans_on_one_residue_is_told_with_that_residue() -> No
     case = campaign(late_ms=0.2)
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 40)}
     lead, other, idle = by["servo_mismatch:X"], by["servo_mismatch:Z"], by["backlash:X"]
-    alone, beside = gain_of(problem, lead, rows_for(problem, [])), gain_of(problem, lead, rows_for(problem, [other]))
+    alone, beside = gain_of(problem, lead, taken(problem, [])), gain_of(problem, lead, taken(problem, [other]))
     assert beside > 1.2 * alone > 0.0
     cost = 0.5 * (alone + beside)
     leans = Selection(lead, gain=beside, score=beside - cost)
@@ -204,7 +204,7 @@ def test_what_two_names_explain_together_counts_for_each_with_the_other_taken_ou
     case, _ = of_backlash()
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
-    by = {f.pick.label: f.pick for f in contest.shortlist(rows_for(problem, []), [], 40)}
+    by = {f.pick.label: f.pick for f in contest.shortlist(taken(problem, []), [], 40)}
     (alone,) = weighed(contest, [by["backlash:X"]])
     beside = weighed(contest, [by["backlash:X"], by["servo_mismatch:X"]])
     evidence = shared(problem, beside)["backlash:X", "servo_mismatch:X"]

@@ -153,6 +153,19 @@ def test_mixture_needs_more_than_one_reading() -> None:
     assert contaminated(rest).gain < 7.0
 
 
+def test_every_run_is_whitened_anew_by_the_filter_of_its_instrument() -> None:
+    colours, lengths, kinds = {"bar": Colour(4e-4), "laser": Colour(3e-4, 0.5, 0.96)}, [50, 1, 30], ["bar", "laser", "laser"]
+    columns = np.random.default_rng(7).normal(size=(81, 3))
+    white, start = unscaled(columns, lengths, kinds, colours), 0
+    for n, kind in zip(lengths, kinds, strict=True):
+        m, c, v = colours[kind].filter()
+        alone = scipy.signal.lfilter([1.0, -m], [1.0, c], columns[start : start + n], axis=0) / np.sqrt(v)
+        alone[0] *= np.sqrt(v)
+        assert white[start : start + n] == pytest.approx(alone, rel=1e-12, abs=1e-12)
+        start += n
+    assert unscaled(columns[:, :0], lengths, kinds, colours).shape == (81, 0)
+
+
 def test_leverage_is_taken_back() -> None:
     rest = noise(PATHS, 9)
     squeezed = tuple(0.7 * r for r in rest)
