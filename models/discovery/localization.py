@@ -82,9 +82,10 @@ def localize_signal(paths: tuple[Path, ...], signal: tuple[F1, ...]) -> Localiza
     mean = {p.label: float(np.mean(s**2)) for p, s in zip(paths, signal, strict=True)}
     along = rows.along.T @ rows.energy / (rows.along.sum(axis=0) + 1e-12)
     ways = {d: float(np.mean(rows.energy[rows.direction == d])) for d in (1, -1) if (rows.direction == d).any()}
+    directions = _strong(ways) if len(ways) == 2 else ()
     time_s, (place, radius) = _time(rows), _place(rows)
     return Localization(
-        tests=_strong(_by_test(paths, signal)), axes=_strong(dict(zip(AXES, along.tolist(), strict=True))), directions=_strong(ways) if len(ways) == 2 else (),
+        tests=_strong(_by_test(paths, signal)), axes=_strong(dict(zip(AXES, along.tolist(), strict=True))), directions=directions,
         runs=_strong(mean), time_s=time_s, position_mm=place, radius_mm=radius,
     )  # fmt: skip
 

@@ -36,7 +36,7 @@ def structure(label: str, **where: object) -> Structure:
         ("unnamed_bump", "second_radius", "through the same place"),
         ("unnamed_lobes:Z3", "ballbar", "another ball in the cup"),
         ("unnamed_surge:X", "second_feed", "at standstill for 410 s"),
-        ("unnamed_wave:EYX", "second_feed", "its millimetres"),
+        ("unnamed_wave:EYX", "second_feed", "in millimetres"),
         ("unnamed_smooth:EYX", "single_axis_laser", "other means"),
         ("unnamed_odd:EYX", "opposite_direction", "from the other side"),
     ],
