@@ -195,7 +195,7 @@ class DeviceFile(DeviceTable):
     @model_validator(mode="after")
     def _whole(self) -> Self:
         if (self.modbus is None) == (self.line is None):
-            raise ValueError("expected one of [modbus] and [line]")
+            raise ValueError("expected either [modbus] or [line], not both")
         for name in NEEDED[self.kind]:
             if name not in self.values:
                 raise ValueError(f"a file of kind {self.kind!r} needs [values.{name}]")

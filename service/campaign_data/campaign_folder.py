@@ -70,7 +70,9 @@ class Campaign:
         """
         errors = self.doc["current_model"]["errors"]
         if self.removed is not None or (errors is not None and self.folder is None):
-            raise Unusable(f"campaign {self.name} is not as it was measured", f"`abbe export {self.name} --out FOLDER` writes a stored one")
+            raise Unusable(
+                f"campaign {self.name} is not as it was measured", f"if it is in the database: abbe export {self.name} --out FOLDER"
+            )
         known = None if errors is None or self.folder is None else read_json(self.folder / errors)
         return write_folder(self.doc, self.runs, self.tables, known, Path(folder))
 

@@ -71,7 +71,7 @@ MeasureCampaign = Callable[[CampaignOrder], Awaitable[JobOutcome]]
 
 @dataclass(frozen=True, slots=True)
 class OrderActions:
-    """Functions that carry out the orders: a rollback, a push of an approved proposal; None: this order is not possible here."""
+    """Functions that carry out the orders: a rollback, and a push of an approved proposal; None if the order is not possible here."""
 
     ordered_rollback: OrderedRollback | None = None
     push: Push | None = None

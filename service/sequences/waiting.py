@@ -63,12 +63,12 @@ def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> Non
     if boot_id != expected.boot_id:
         raise PreconditionsChanged(
             f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
-            "its clock started again: measure a new campaign; the complete runs of this one are kept",
+            "its clock started again: measure a new campaign; the complete runs of this campaign are kept",
         )
     if table_crc != expected.table_crc:
         raise PreconditionsChanged(
             f"another compensation table is active (CRC {table_crc:08X} instead of {expected.table_crc:08X})",
-            "make the old one active again, or measure a new campaign",
+            "make the old table active again, or measure a new campaign",
         )
 
 

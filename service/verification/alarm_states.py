@@ -112,7 +112,7 @@ Note = Callable[[AlarmKind, AlarmFacts], Awaitable[Alarm]]
 
 
 def after_check(now: Alarm | None, found: FiredRule) -> AlarmKind | None:
-    """Return the effect of a check on ``now``, the alarm of its recipe (None: no alarm); None if the check has no effect."""
+    """Return the effect of a check on the alarm of its recipe (``now``; None without an alarm). None: the check has no effect."""
     if not found.judged:
         return None
     if now is None or not now.active:

@@ -119,7 +119,7 @@ async def identified(auth: Authenticator, origin: LoginOrigin, name: str, secret
 async def signature_refusal(
     auth: Authenticator, request: Request, password: str, wrong: str = "The password is wrong: nothing was signed."
 ) -> Response | None:
-    """Return the refusal of a wrong password that a logged-in person gave as signature; None: it is right.
+    """Check the password that a logged-in person gave as signature: return the refusal, or None if the password is right.
 
     A wrong password counts as a wrong login.
     """

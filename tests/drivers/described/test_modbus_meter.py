@@ -136,7 +136,7 @@ async def test_a_file_that_cannot_be_right_is_one_line(url: str, tmp_path: Path,
 async def test_a_missing_file_names_the_shipped_ones(url: str) -> None:
     with pytest.raises(BadDeviceFile, match="does not exist"):
         await open_meter(parse_url(url.replace(str(FILE), "no-such-device")))
-    with pytest.raises(BadUrl, match="another wire"):
+    with pytest.raises(BadUrl, match="another kind of line"):
         await open_meter(parse_url(f"socket://127.0.0.1:1?device={FILE}"))
 
 
