@@ -34,8 +34,8 @@ from abbe.service.verification.verify import VerificationFigures
 
 TRUTH: Literal["sealed truth of the simulator"] = "sealed truth of the simulator"
 DIAGONALS_TOLD = (
-    "A measured body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. It begins 10 mm inside the "
-    "strokes and leaves out its far end, which the machine reaches one way only; so it is smaller than from corner to corner."
+    "A measured body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. It begins and ends 10 mm "
+    "inside the strokes; so it is smaller than from corner to corner."
 )
 ALL_OBSERVABLE = (
     "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"

@@ -64,10 +64,14 @@ def _with_judge(fitted: Helix | Diagonal, judge: Helix | Diagonal) -> list[Recip
     return [replace(fitted, unmount=False), replace(judge, label=f"judge-{fitted.label}", role="holdout", mount=False)]
 
 
+OVERRUN_MM = 2.0
+"""Overrun of plain body diagonals: more than any lost motion, so that the machine reaches the far end from both sides."""
+
+
 def verification(machine: Machine, *, rate_hz: int = 100, name: str = "verify", role: str = "holdout") -> CampaignPlan:
     """Return one helix (with a centre and radius that the identification does not use) and the four plain body diagonals."""
     recipes: list[Recipe] = [verification_helix(machine, rate_hz=rate_hz, role=role)]
-    recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "") for d in DIAGONALS]
+    recipes += [Diagonal(f"check-{d}", f"V{d}", role, d, 20, "", overrun_mm=OVERRUN_MM) for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
 
 
@@ -81,7 +85,7 @@ def quick_check(machine: Machine, *, rate_hz: int = 100, name: str = "quick-chec
     """Return the unattended check: the tests of the verification with half the positions, a few minutes of machine time."""
     centre, radius = hemisphere(machine, (0.45, 0.55, 0.12), 0.7)
     recipes: list[Recipe] = [Helix("check-helix", "VB", "holdout", centre, radius, turns=3, rate_hz=rate_hz)]
-    recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "") for d in DIAGONALS]
+    recipes += [Diagonal(f"check-{d}", f"V{d}", "holdout", d, 10, "", overrun_mm=OVERRUN_MM) for d in DIAGONALS]
     return CampaignPlan(name, tuple(r.plan(machine) for r in recipes))
 
 
