@@ -241,12 +241,12 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
     if before is None:
         return
     then, now = found_feature(before), found_feature(touched)
-    meanwhile = f"(features touched meanwhile: {sum(not one.qualifies for one in earlier)})"
+    count = sum(not one.qualifies for one in earlier)
     drift, expanded = now.radius_mm - then.radius_mm, COVERAGE * math.hypot(then.u_radius_mm, now.u_radius_mm)
     if abs(drift) > QUALIFIED_MM + expanded:
         raise SetupDisturbed(
-            f"{touched.what}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um {meanwhile}: "
-            "the stylus is no longer as it was qualified",
+            f"{touched.what}: its radius changed by {1e3 * drift:+.1f} ± {1e3 * expanded:.1f} um "
+            f"(features touched meanwhile: {count}): the stylus is no longer as it was qualified",
             f"tighten or change the stylus and qualify it; {_ANEW}",
         )
     moved = math.dist(now.centre_mm, then.centre_mm)
@@ -257,6 +257,6 @@ def check_same(touched: TouchedFeature, earlier: Sequence[TouchedFeature]) -> No
             else ("the artefact is loose", "clamp the artefact firmly")
         )
         raise SetupDisturbed(
-            f"{touched.what} moved by {1e3 * moved:.0f} um {meanwhile}: {why}",
+            f"{touched.what} moved by {1e3 * moved:.0f} um (features touched meanwhile: {count}): {why}",
             f"{remedy}; {_ANEW}",
         )
