@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -16,6 +17,8 @@ if TYPE_CHECKING:
     from abbe.models.solvers.joint import JointSolution
 
 SAME_MM = 3.0
+NEAR_MM = 0.01
+"""Positions along a line that differ by less are the same."""
 U_REPEAT_MM = 1e-4
 """Repeatability of the helix figure after mounting the ball-bar again: assumed, not measured."""
 
@@ -30,15 +33,17 @@ class VerificationFigure:
     deviation_mm: F1
 
 
-def diagonal_figure(run: RunData) -> VerificationFigure:
+def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> VerificationFigure:
     """Return the range of the mean deviation (out and back) along a body diagonal, with its uncertainty (ISO 230-6 style).
 
     Half of (out - back) is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
-    length. Readings are paired by their position on the line, so a missing reading removes only its own pair.
+    length. Readings are paired by their position on the line, so a missing reading removes only its own pair. ``turning_mm``: where the
+    machine turned beyond the ends, (3,) each; these are no positions of the test.
     """
     assert run.beam is not None
     s = np.round((run.axes_mm - run.axes_mm[0]) @ run.beam, 4)
-    places = np.unique(s)
+    turns = [float((point - run.axes_mm[0]) @ run.beam) for point in turning_mm]
+    places = [p for p in np.unique(s) if all(abs(p - turn) > NEAR_MM for turn in turns)]
     turn = int(np.argmax(s))
     out = {float(p): float(v) for p, v in zip(s[: turn + 1], run.deviation_mm[: turn + 1], strict=True)}
     back = {float(p): float(v) for p, v in zip(s[turn + 1 :], run.deviation_mm[turn + 1 :], strict=True)}

@@ -119,6 +119,7 @@ def _truth(argv: Sequence[str]) -> int:
     parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
     parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
     parser.add_argument("--plane", type=float, nargs=5, metavar=("X0", "X1", "Y0", "Y1", "Z"), help="add the rms in this plane, mm")
+    parser.add_argument("--inside-mm", type=float, default=0.0, help="body diagonals of the box so far inside the strokes (default: 0)")
     options = parser.parse_args(argv)
     scenario = _scenario(options)
     if options.seed is not None:
@@ -127,7 +128,8 @@ def _truth(argv: Sequence[str]) -> int:
     if options.nodes < 2:
         parser.error("--nodes must be at least 2")
     image = None if options.bank is None else options.bank.read_bytes()
-    sys.stdout.write(json.dumps(truth(scenario, image, options.nodes, arrows=options.arrows, plane=options.plane)) + "\n")
+    found = truth(scenario, image, options.nodes, arrows=options.arrows, plane=options.plane, inside_mm=options.inside_mm)
+    sys.stdout.write(json.dumps(found) + "\n")
     return 0
 
 

@@ -71,9 +71,9 @@ def rms_norm(vectors: F) -> float:
     return float(np.sqrt(np.mean(np.sum(vectors * vectors, axis=1))))
 
 
-def body_diagonals_um(machine: Machine, correction: Correction = no_correction) -> dict[str, float]:
-    """Return the range (max - min) of the deviation along each body diagonal of the stroke box, µm."""
-    low, high = machine.geometry.low_mm, machine.geometry.high_mm
+def body_diagonals_um(machine: Machine, correction: Correction = no_correction, inside_mm: float = 0.0) -> dict[str, float]:
+    """Return the range (max - min) of the deviation along each body diagonal of the box that lies so far inside the strokes, µm."""
+    low, high = machine.geometry.low_mm + inside_mm, machine.geometry.high_mm - inside_mm
     result = {}
     for name, signs in DIAGONALS.items():
         forward = np.array(signs) > 0
@@ -91,11 +91,14 @@ def best_nine_tables_rms_um(machine: Machine, nodes: int = FINE_NODES) -> float:
     return 1000.0 * rms_norm(without_rigid_motion(points, rest))
 
 
-def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool = False) -> dict[str, object]:
-    """Return all error figures of the machine with a correction (µm); ``arrows`` adds grid and deviation vectors for plotting."""
+def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool = False, inside_mm: float = 0.0) -> dict[str, object]:
+    """Return all error figures of the machine with a correction (µm); ``arrows`` adds grid and deviation vectors for plotting.
+
+    ``inside_mm``: of `body_diagonals_um`.
+    """
     points = grid(machine, nodes)
     rest = without_rigid_motion(points, deviation(machine, points, correction))
-    diagonals = body_diagonals_um(machine, correction)
+    diagonals = body_diagonals_um(machine, correction, inside_mm)
     figures: dict[str, object] = {
         "max_body_diagonal_um": max(diagonals.values()),
         "body_diagonals_um": diagonals,
@@ -124,11 +127,17 @@ def plane_rms_um(machine: Machine, correction: Correction, box_mm: list[float]) 
 
 
 def truth(
-    scenario: Scenario, image: bytes | None, nodes: int, *, arrows: bool = False, plane: list[float] | None = None
+    scenario: Scenario,
+    image: bytes | None,
+    nodes: int,
+    *,
+    arrows: bool = False,
+    plane: list[float] | None = None,
+    inside_mm: float = 0.0,
 ) -> dict[str, object]:
     """Return the true errors of a scenario's machine; ``image`` is a compensation image as big-endian bytes, None for no correction.
 
-    ``plane``: adds `plane_rms_um` of this box.
+    ``plane``: adds `plane_rms_um` of this box; ``inside_mm``: of `body_diagonals_um`.
     """
     draws = draw_machine(scenario)
     machine = Machine(Geometry(scenario.machine), draws)
@@ -136,7 +145,7 @@ def truth(
     hidden: dict[str, object] = {} if secret is None else {"hidden": secret.describe()}
     correction = no_correction if image is None else _correction(image)
     flat: dict[str, object] = {} if plane is None else {"plane_rms_um": plane_rms_um(machine, correction, plane)}
-    return {**report(machine, correction, nodes, arrows=arrows), **describe(draws), **hidden, **flat}
+    return {**report(machine, correction, nodes, arrows=arrows, inside_mm=inside_mm), **describe(draws), **hidden, **flat}
 
 
 def _correction(image: bytes) -> bank.Correction:

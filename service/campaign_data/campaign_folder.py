@@ -12,6 +12,7 @@ from abbe.service.domain.document import record
 from abbe.service.domain.machine import DeviceUrls
 from abbe.service.domain.measured import CampaignHead
 from abbe.service.domain.run import Run
+from abbe.service.domain.run_file import CAMPAIGN_FORMAT
 from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.errors import CampaignRefused, Unusable
 from abbe.service.runs.cases import with_earliest_mounting
@@ -66,13 +67,14 @@ class Campaign:
         FileFormatError
             The folder exists and is not empty, or cannot be written.
         Unusable
-            A table was subtracted from the readings, or the campaign is one of the store with a file of errors.
+            The campaign is of a database, which alone holds its tables; or a table was subtracted from the readings.
         """
-        errors = self.doc["current_model"]["errors"]
-        if self.removed is not None or (errors is not None and self.folder is None):
-            raise Unusable(
-                f"campaign {self.name} is not as it was measured", f"if it is in the database: abbe export {self.name} --out FOLDER"
-            )
+        errors = self.doc.get("current_model", {}).get("errors")
+        acting = {run.table.acting_crc for run in self.runs if run.table.acting_crc is not None}
+        if self.folder is None and (self.doc.get("format") != CAMPAIGN_FORMAT or errors is not None or not acting <= set(self.tables)):
+            raise Unusable(f"campaign {self.name} was read from a database", f"write it with its tables: abbe export {self.name} FOLDER")
+        if self.removed is not None:
+            raise Unusable(f"a table was subtracted from the readings of campaign {self.name}", "save the campaign as it was read")
         known = None if errors is None or self.folder is None else read_json(self.folder / errors)
         return write_folder(self.doc, self.runs, self.tables, known, Path(folder))
 

@@ -94,7 +94,9 @@ def _artefact(setup: ArtefactSetup, known: dict[str, Feature], columns: Columns)
     read = np.column_stack([columns.further.get(f"deviation_{a}_mm", np.full(len(names), np.nan)) for a in AXES]).astype(np.float64)
     nominal = np.array([known[name].nominal_mm if known[name].normal is None else [np.nan] * 3 for name in names])
     own = (columns.q_mm - setup.pose.origin_mm) @ setup.pose.matrix - nominal
-    away = np.nan_to_num(np.abs(own - read)).max(axis=1) * columns.valid
+    off = np.where(columns.valid[:, None], own - read, np.nan)
+    off = off - [np.nanmedian(one) if np.isfinite(one).any() else 0.0 for one in off.T]  # the solution fits the pose's origin
+    away = np.nan_to_num(np.abs(off)).max(axis=1)
     worst = int(np.argmax(away))
     if away[worst] <= TOLERANCE_MM:
         return None

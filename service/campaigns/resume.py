@@ -180,7 +180,8 @@ class _Finder:
         kept = len(item.resume_trail.carried)
         how = f"resumes after point {kept}, which is read again" if kept else "begins again"
         if item.resume_trail.again:
-            how = f"resumes after {item.resume_trail.n_features} features; the first one is touched again"
+            n = item.resume_trail.n_features
+            how = f"resumes after {n} features; the first one is touched again" if n else "resumes; the sphere is touched again"
         if item.remainder is not None:
             at = f"{item.remainder.offset_mm:.0f} of {item.remainder.whole_mm:.0f} mm"
             how = f"resumes at {at} of its path, and reads a stretch before it again"

@@ -24,6 +24,7 @@ from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.machine_text import machine_text
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
+from abbe.service.sequences.recipes.recipe import CLEARANCE_MM
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
 from abbe.service.verification.verify import figure_rows
@@ -140,8 +141,9 @@ async def run_demo(seed: int, speed: float, folder: Path, progress: ProgressSink
             store.close()
     progress(Progress("truth", 0.0, 1.0, None, "reading the simulator's sealed truth"))
     bank = folder / "active_bank.bin"
-    result.truth_before = await sealed_truth(simulator_args, None)
-    result.truth_after = await sealed_truth(simulator_args, bank)
+    truth_args = [*simulator_args, "--inside-mm", f"{CLEARANCE_MM:g}"]  # as the verification measures the diagonals
+    result.truth_before = await sealed_truth(truth_args, None)
+    result.truth_after = await sealed_truth(truth_args, bank)
     result.duration_s = clock.monotonic_s() - start
     return result
 

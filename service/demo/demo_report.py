@@ -34,14 +34,14 @@ from abbe.service.verification.verify import VerificationFigures
 
 TRUTH: Literal["sealed truth of the simulator"] = "sealed truth of the simulator"
 DIAGONALS_TOLD = (
-    "A measured body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. It begins and ends 10 mm "
-    "inside the strokes; so it is smaller than from corner to corner."
+    "A body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. Measured and true, it begins and ends "
+    "10 mm inside the strokes."
 )
 ALL_OBSERVABLE = (
     "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"
 )
 TRUTH_TITLES = {
-    "max_body_diagonal_um": "Largest body diagonal, corner to corner",
+    "max_body_diagonal_um": "Largest body diagonal",
     "volumetric_rms_um": "Volumetric error, rms",
     "volumetric_max_um": "Volumetric error, maximum",
 }

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
+from itertools import islice
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,7 @@ from abbe.service.domain.imported_file import SourceFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.ballbar import read_b5r
 from abbe.service.instrument_files.columns import ColumnFile, guesses, read_table, table_of
-from abbe.service.instrument_files.content import AxisReadings, Content, read_bytes
+from abbe.service.instrument_files.content import AxisReadings, Content, read_bytes, text_file
 from abbe.service.instrument_files.dynamic import read_rtx
 from abbe.service.instrument_files.mean_tables import read_pos, read_ren
 from abbe.service.instrument_files.renishaw import read_renishaw
@@ -71,10 +73,12 @@ def headings_of(path: Path, heading: int) -> list[str]:
 
 
 FIRST_ROWS = 40
+NUMBER = re.compile(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?")
 
 
 def likely_heading(path: Path) -> int:
-    """Row that looks most like headings: of the first forty, the one with the most columns of known meaning; 1 if none has two.
+    """Row that looks most like headings: of the first forty, the one with the most columns of known meaning above a row with a number; 1 if
+    none has two.
 
     Raises
     ------
@@ -83,14 +87,15 @@ def likely_heading(path: Path) -> int:
     """
     raw, most, found = read_bytes(path), 1, 1
     book = table_of(path.name, raw, 1) if path.suffix.lower() in WORKBOOKS else None
-    first = b"\n".join(raw.splitlines()[:FIRST_ROWS])
+    first = b"" if book else "\n".join(text for _, text in islice(text_file(path.name, raw).lines(), FIRST_ROWS)).encode()
     for row in range(1, FIRST_ROWS + 1):
         try:
-            names = (book or table_of(path.name, first, row)).headings(row)
+            table = book or table_of(path.name, first, row)
+            known = len({name for _, name in guesses(table.headings(row))})
         except FileFormatError:
             continue
-        known = len({name for _, name in guesses(names)})
-        if known > most:
+        below = [cell for line, cells in table.rows if row < line <= row + 2 for cell in cells]
+        if known > most and any(NUMBER.fullmatch(cell.strip()) for cell in below):
             most, found = known, row
     return found
 

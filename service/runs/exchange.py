@@ -10,6 +10,7 @@ import zlib
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import count
 from pathlib import Path
 
 from abbe.service.domain.document import Doc
@@ -196,9 +197,10 @@ def write_folder(campaign: Doc, runs: list[Run], tables: Mapping[int, bytes], er
         The target exists and is not an empty folder, or cannot be written.
     """
     entries, setups = list[Doc](), dict[str, Doc]()
+    taken = {CAMPAIGN_FILE, str(campaign["current_model"]["errors"])}
     with _whole_folder(target) as folder:
         for run in runs:
-            entry = {"run_id": run.run_id, "test": run.test, "role": run.role, "file": f"{_safe(run.run_id)}.json"}
+            entry = {"run_id": run.run_id, "test": run.test, "role": run.role, "file": _free_name(run.run_id, taken)}
             entries.append(entry)
             setups.setdefault(run.setup.setup_id, {"kind": run.test.partition("_")[0], "t_set_s": run.setup.t_set_s})
             _write_json(folder / entry["file"], run.to_document())
@@ -234,13 +236,14 @@ def _whole_folder(target: Path) -> Iterator[Path]:
 
 def _write_folder(store: Store, record: CampaignRecord, runs: list[RunRecord], folder: Path, images: Images, *, csv: bool) -> None:
     entries, setups, written = [], dict[str, Doc](), list[Run]()
+    taken = {CAMPAIGN_FILE, *(str(RunEntry.read(run.start.entry).file) for run in runs if run.start.entry)}
     joined = {piece.run for run in runs if run.status == COMPLETE for piece in run.start.pieces}
     for run in runs:
         if run.id in joined:
             continue  # its readings are part of the resumed run: a measurement must not count twice
         chunks = store.chunks.of_run(run.id)
         read = whole_run(store, run) if run.status == COMPLETE else single_run(run, chunks)
-        entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": f"{_safe(run.label)}.json"}
+        entry = run.start.entry or {"run_id": run.label, "test": run.test, "role": run.role, "file": _free_name(run.label, taken)}
         entries.append(entry)
         written.append(read)
         if read.setup.t_set_s is None:
@@ -277,8 +280,12 @@ def _imported(entry: Doc, run: Doc, read: Run) -> ImportedRun:
     return ImportedRun(read.run_id, read.test, read.role, start_doc, len(read.columns), JSON_CODEC, payload)
 
 
-def _safe(label: str) -> str:
-    return "".join(one if one.isalnum() or one in "-_." else "_" for one in label)
+def _free_name(label: str, taken: set[str]) -> str:
+    """Return a file name for a run that none of the ``taken`` has, and add it to them."""
+    safe = "".join(one if one.isalnum() or one in "-_." else "_" for one in label)
+    name = next(name for k in count(1) if (name := f"{safe}{'' if k == 1 else f'-{k}'}.json") not in taken)
+    taken.add(name)
+    return name
 
 
 def _write_bytes(path: Path, content: bytes) -> None:

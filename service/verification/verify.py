@@ -80,7 +80,7 @@ def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> Verif
         if run.test == "laser_diagonal" and not run.laser.order and not run.laser.face:
             check_judged(run)
             try:
-                diagonals[run.laser.diagonal] = diagonal_figure(run_data(run))
+                diagonals[run.laser.diagonal] = diagonal_figure(run_data(run), run.laser.ends_mm if run.laser.overrun_mm else ())
             except ValueError as error:
                 raise MeasurementFault(str(error), "measure it again") from None
         elif run.test == "ballbar_helix":

@@ -246,6 +246,7 @@ def test_an_idle_core_holds_nothing_that_answers_alarms() -> None:
     assert "abbe.service.core.orders" in loaded
     seldom = {"abbe.service.jobs.investigate", "abbe.service.jobs.guided_campaign", "abbe.service.discovery.discover"}
     solving = {"abbe.service.identification.solve", "abbe.service.compensation.push_approved", "abbe.models.solvers.joint"}
+    solving.add("abbe.models.uncertainty.monte_carlo")
     assert not {*seldom, *solving, "abbe.models.effects.catalogue", "abbe.service.report.report"} & loaded
 
 

@@ -68,6 +68,11 @@ def test_a_simulated_campaign_can_be_saved_for_the_command_line(campaign: abbe.C
     ]
     again = abbe.read_campaign(read.save(tmp_path / "again"))
     assert [run.to_document() for run in again.runs] == [run.to_document() for run in read.runs]
+    one, two = (replace(run, run_id=name) for run, name in zip(campaign.runs, ("a b", "campaign"), strict=False))
+    odd = replace(campaign, runs=[one, two, replace(two, run_id="a_b")])
+    assert [run.run_id for run in abbe.read_campaign(odd.save(tmp_path / "odd")).runs] == ["a b", "campaign", "a_b"]
+    with pytest.raises(abbe.AbbeError, match="abbe export june FOLDER"):
+        replace(campaign, doc={}).save(tmp_path / "none")
     with pytest.raises(abbe.AbbeError, match="not an empty folder"):
         campaign.save(tmp_path / "june")
 

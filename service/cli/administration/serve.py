@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -11,7 +12,7 @@ from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude,
 from abbe.service.errors import AbbeError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
+    from collections.abc import Awaitable, Callable
 
     from abbe.service.capture.live import LiveFeed
     from abbe.service.channel.messages import MachineSummary
@@ -191,13 +192,22 @@ def duties_on(
             await investigate(InvestigationContext(site, store, plan, clock, progress, control, live), one, note)
 
         async def push(order: PushOrder) -> JobOutcome:
-            from abbe.service.compensation.push_approved import push_approved
-
-            return await push_approved(site, store, order, clock=clock, rate_hz=rate_hz)
+            return await (await _push_approved())(site, store, order, clock=clock, rate_hz=rate_hz)
 
         return Duties(alarm.warn_days, alarm.campaign, look_into, push if alarm.push == "approved" else None)
 
     return duties
+
+
+async def _push_approved() -> Callable[..., Awaitable[JobOutcome]]:
+    """Load `push_approved` in a thread: it imports the solver, half a second in which page and messages must not wait."""
+
+    def loaded() -> Callable[..., Awaitable[JobOutcome]]:
+        from abbe.service.compensation.push_approved import push_approved
+
+        return push_approved
+
+    return await asyncio.to_thread(loaded)
 
 
 def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], OrderActions]:
@@ -214,9 +224,7 @@ def order_actions_on(alarm: AlarmSection, site: Site) -> Callable[[Store], Order
             return await ordered_rollback(site, store, order, clock=SystemClock())
 
         async def push(order: PushOrder) -> JobOutcome:
-            from abbe.service.compensation.push_approved import push_approved
-
-            return await push_approved(site, store, order, clock=SystemClock())
+            return await (await _push_approved())(site, store, order, clock=SystemClock())
 
         return OrderActions(back, push if alarm.push == "never" else None)
 

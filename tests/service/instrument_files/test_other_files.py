@@ -275,9 +275,11 @@ def test_a_column_file_comes_back_as_it_was(folder: Folder) -> None:
     [
         ("Target (mm);Error (um)\n0;0.1\n100;0.4\n", 1),
         ("Position error test, hall 3\nAir 20.1\n\nTarget (mm),Error (um)\n0,0.1\n", 4),
+        ("Position error measured by John\nTarget;Deviation\n0;0.1\n", 2),
         ("0 0.1\n100 0.4\n", 1),
     ],
 )
 def test_the_row_of_the_headings_is_proposed_below_a_preamble(folder: Folder, text: str, row: int) -> None:
-    (folder.path / "t.csv").write_text(text)
-    assert likely_heading(folder.path / "t.csv") == row
+    for encoding in ("utf-8", "utf-16"):
+        (folder.path / "t.csv").write_bytes(text.replace("\n", "\r\n").encode(encoding))
+        assert likely_heading(folder.path / "t.csv") == row

@@ -96,16 +96,20 @@ def test_what_cannot_be_evaluated_is_told_and_stops_nothing():
     assert "valid readings" in refused[0]
 
 
-def test_the_verifications_range_is_the_standards_m():
-    """Two ways through the code, one figure: `abbe.models.verification` and ISO 230-6."""
+@pytest.mark.parametrize("overrun_mm", [0.0, 2.0])
+def test_the_verifications_range_is_the_standards_m(overrun_mm: float):
+    """Two ways through the code, one figure: `abbe.models.verification` and ISO 230-6. Turning points are no positions."""
     run = line(
-        Linear("l", "L", "identify", 0, positions=9, at_share=(0.15, 0.15)),
+        Linear("l", "L", "identify", 0, positions=9, at_share=(0.15, 0.15), overrun_mm=overrun_mm),
         lambda x, d: 1e-8 * (x - 200.0) ** 2 + 0.003 * (d < 0) + 1e-4 * np.sin(x * d),
     )
     run |= {"test": "laser_diagonal", "setup": run["setup"] | {"diagonal": "ppp"}}
     (test,) = diagonal_tests([run_of(run)], [])["body"]
     by = {f.symbol: f for f in evaluate([run_of(run)]).figures}
-    old = diagonal_figure(run_data(run_of(run)))
+    ends = run_of(run).laser.ends_mm if overrun_mm else ()
+    old = diagonal_figure(run_data(run_of(run)), ends)
+    assert old.position_mm[[0, -1]] == pytest.approx([overrun_mm, 580.0 + overrun_mm])
+    assert len(old.position_mm) == 9
     assert by["M_d"].value == pytest.approx(old.value_mm * 1e3, rel=1e-9)
     assert by["M_d"].u > old.u_mm * 1e3  # the temperature of the scales on top
     assert any("npp, pnp, ppn not measured" in line for line in evaluate([run_of(run)]).not_observable)
