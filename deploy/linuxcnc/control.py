@@ -116,9 +116,7 @@ class Control:
 
     def mdi(self, line: str) -> None:
         """Execute one line of G-code."""
-        self._poll()
-        if self._status.task_mode != linuxcnc.MODE_MDI:  # to ask for a mode costs tens of milliseconds
-            self._mode(linuxcnc.MODE_MDI)
+        self._mode(linuxcnc.MODE_MDI)
         self._command.mdi(line)
         self._sent = self._command.serial
 

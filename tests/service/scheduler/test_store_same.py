@@ -85,7 +85,7 @@ def measured(ask: Any) -> None:
         ask.machines.add(name, DOC)
     ask.machines.get(1), ask.machines.get(9), ask.machines.all()
     ask.campaigns.add(1, "june", DOC), ask.campaigns.add(2, "May", DOC)
-    ask.campaigns.find("june"), ask.campaigns.find(2), ask.campaigns.find("July"), ask.campaigns.all()
+    ask.campaigns.find("june"), ask.campaigns.find(2), ask.campaigns.find("July"), ask.campaigns.all(), ask.campaigns.matching("j*")
     ask.runs.start(1, "r1", "helix", "fit", DOC)
     ask.chunks.append(1, "bar", 0, 32, "raw", BYTES, 0.1, 0.2, 2**40, 2**40 + 9)
     more = ChunkRecord(1, "bar", 1, 3, "raw", 2**32 - 1, BYTES, -1e-7, 1e300, -(2**40), 2**62)
