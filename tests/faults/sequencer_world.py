@@ -112,19 +112,19 @@ class Paced(Simulated):
     While this process gets no core, the machine stands, too: at 200 times, a pause of 0.15 s would bring 30 s of samples at once.
     """
 
-    speed, _at_s, _last_s = 1.0, 0.0, 0.0
+    speed, longest_step_s, _at_s, _last_s = 1.0, LONGEST_STEP_S, 0.0, 0.0
 
     def _advance(self) -> None:
         now = asyncio.get_running_loop().time()
         if self._last_s:
-            self._at_s += min(self.speed * (now - self._last_s), LONGEST_STEP_S)
+            self._at_s += min(self.speed * (now - self._last_s), self.longest_step_s)
         self._last_s = now
         self.world.advance(self._at_s)
 
-    def pace(self, speed: float) -> None:
-        """From now on so many simulated seconds per second."""
+    def pace(self, speed: float, longest_step_s: float = LONGEST_STEP_S) -> None:
+        """From now on so many simulated seconds per second, and no step of time longer than this, however busy the computer is."""
         self.advance()
-        self.speed = speed
+        self.speed, self.longest_step_s = speed, longest_step_s
 
     def now_s(self) -> float:
         """Simulated time."""

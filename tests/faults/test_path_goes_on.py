@@ -28,6 +28,7 @@ from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
 
 SPEED = 100.0
 FEED = 4500.0
+STEP_S = 0.1
 LONG_S = 2.0 * np.pi * 60.0 * 3.0 / (FEED / 60.0)
 
 
@@ -61,8 +62,10 @@ class After(AtStep):
         self.waiting = asyncio.get_running_loop().create_task(self._when())
 
     async def _when(self) -> None:
+        """Comes near in small steps: what a busy computer needs to notice must not be much of the path."""
+        self._b.sim.pace(self._b.sim.speed, STEP_S)
         await self._on_path_for(self._after_s - 3.0)
-        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0)  # what a busy computer needs to notice must not be much of the path
+        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0, STEP_S)
         await self._on_path_for(self._after_s)
         self._do_it()
 
