@@ -25,7 +25,7 @@ from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control, Watching
 from abbe.service.sequences.recipes import recipe as recipes
 from abbe.service.sequences.recipes.recipe_file import shared_setups
-from abbe.service.sequences.steps import CampaignPlan, MoveTo, TestPlan
+from abbe.service.sequences.steps import CampaignPlan, MoveTo, RecordPath, TestPlan
 from abbe.service.site import Site, machine_doc
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc.log import Command
@@ -103,7 +103,7 @@ def on_one_cup(*radii_mm: float) -> CampaignPlan:
     return CampaignPlan("c", tuple(r.plan(MACHINE) for r in shared_setups(made, "test")))
 
 
-LONGEST_STEP_S = 2.0
+LONGEST_STEP_S, NEAR_STEP_S = 2.0, 0.1
 
 
 class Paced(Simulated):
@@ -207,6 +207,31 @@ class AtStep(Control):
                 asyncio.get_running_loop().call_later(self._delay_s, self._do)
             else:
                 self._do()
+
+
+class After(AtStep):
+    """Does something when the path has run for so many seconds of machine time."""
+
+    def __init__(self, plan: CampaignPlan, b: Bench, after_s: float, do: Callable[[], None], *, step: int | None = None) -> None:
+        super().__init__(step or number(plan, 0, RecordPath), lambda: None)
+        self._b, self._after_s, self._do_it = b, after_s, do
+        self._do = self._begin
+
+    def _begin(self) -> None:
+        self.waiting = asyncio.get_running_loop().create_task(self._when())
+
+    async def _when(self) -> None:
+        """Comes near in small steps: what a busy computer needs to notice must not be much of the path."""
+        self._b.sim.pace(self._b.sim.speed, NEAR_STEP_S)
+        await self._on_path_for(self._after_s - 3.0)
+        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0, NEAR_STEP_S)
+        await self._on_path_for(self._after_s)
+        self._do_it()
+
+    async def _on_path_for(self, seconds: float) -> None:
+        controller = self._b.sim.world.controller
+        while seconds > 0.0 and not (controller.path_running and self._b.sim.world.time_s - controller.path_start_s >= seconds):  # noqa: ASYNC110 - simulated time
+            await asyncio.sleep(0.001)
 
 
 class InTest(Control):

@@ -22,10 +22,10 @@ from abbe.service.runs.chunks import decode_bar
 from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.journal import HAND, INCIDENT, NoJournal
 from abbe.service.sequences.runner import Runner
-from abbe.service.sequences.steps import CampaignPlan, RecordPath
+from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.simulators.ballbar.wire import WITH_SETTINGS_BCD
-from tests.faults.sequencer_world import AtStep, Bench, bench, number, small
+from tests.faults.sequencer_world import After, Bench, bench, small
 from tests.faults.serial_rig import stage
 
 SPEED = 30.0
@@ -42,11 +42,11 @@ class Hand:
         monkeypatch.setattr(b.sim.world.ballbar, "forget_settings", lambda: b.sim.world.ballbar.switch(zero_mm=ZERO_MM))
         self.boots = [b.sim.box._boot_id]
 
-    def soon(self, delay_s: float, plug_s: float | None) -> None:
+    def pull(self, plug_s: float | None) -> None:
         async def work() -> None:
-            await asyncio.sleep(delay_s)
             await self._b.sim.unplug()
             self.boots.append(self._b.sim.box._boot_id)
+            self._b.sim.pace(SPEED)
             if plug_s is not None:
                 await asyncio.sleep(plug_s)
                 await self._b.sim.plug()
@@ -68,8 +68,9 @@ async def yes(_: str) -> bool:
     return True
 
 
-def pulled_on_the_path(hand: Hand, plug_s: float | None) -> AtStep:
-    return AtStep(number(PLAN, 0, RecordPath), lambda: hand.soon(0.3, plug_s))
+def pulled_on_the_path(b: Bench, hand: Hand, plug_s: float | None) -> After:
+    """Pulls once the axes move on the path, which they do only when the bar has been read."""
+    return After(PLAN, b, 3.0, lambda: hand.pull(plug_s))
 
 
 def whole(store: Store, run_id: int) -> list[int]:
@@ -85,7 +86,7 @@ async def test_the_cable_is_pulled_and_put_back_and_the_test_begins_again(place,
     hand = Hand(b, monkeypatch)
     before = b.session.ballbar.settings
     site = replace(b.site, watching=Watching(None, GOES_ON, unknown_s=5.0))
-    (run_id,) = await measure(b.session, store, site, PLAN, options=MeasureOptions(pulled_on_the_path(hand, 0.3), yes))
+    (run_id,) = await measure(b.session, store, site, PLAN, options=MeasureOptions(pulled_on_the_path(b, hand, 0.3), yes))
     broken, complete = store.runs.all()
     assert [(one.label, one.status) for one in (broken, complete)] == [("test", "failed"), ("test-2", "complete")]
     assert broken.reason.startswith("DRV-002")
@@ -109,7 +110,7 @@ async def test_without_the_option_it_ends_and_goes_on_in_the_same_session(place,
     b, store = place
     hand = Hand(b, monkeypatch)
     with pytest.raises(LinkDown):
-        await measure(b.session, store, b.site, PLAN, options=MeasureOptions(pulled_on_the_path(hand, None), yes))
+        await measure(b.session, store, b.site, PLAN, options=MeasureOptions(pulled_on_the_path(b, hand, None), yes))
     await b.sim.plug()
     found = await resume(b.session, store, b.site, PLAN, "c", yes)
     (run_id,) = await measure(b.session, store, b.site, PLAN, options=MeasureOptions(None, yes, None, found))
@@ -122,7 +123,7 @@ async def test_whoever_waits_for_the_box_can_be_stopped(place, monkeypatch) -> N
     b, store = place
     hand = Hand(b, monkeypatch)
     site = replace(b.site, watching=Watching(None, GOES_ON, unknown_s=5.0))
-    control = pulled_on_the_path(hand, None)
+    control = pulled_on_the_path(b, hand, None)
     task = asyncio.create_task(measure(b.session, store, site, PLAN, options=MeasureOptions(control, yes)))
     async for now in control.watch():
         if now.state == State.SUSPENDED:

@@ -22,13 +22,12 @@ from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import export_folder, import_folder
 from abbe.service.sequences.control import State, Suspending, Watching
 from abbe.service.sequences.recipes.recipe import Helix
-from abbe.service.sequences.steps import CampaignPlan, RecordPath
+from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
-from tests.faults.sequencer_world import MACHINE, AtStep, Bench, bench, number
+from tests.faults.sequencer_world import MACHINE, After, Bench, bench
 
 SPEED = 100.0
 FEED = 4500.0
-STEP_S = 0.1
 LONG_S = 2.0 * np.pi * 60.0 * 3.0 / (FEED / 60.0)
 
 
@@ -48,31 +47,6 @@ def helix() -> CampaignPlan:
 
 async def yes(_: str) -> bool:
     return True
-
-
-class After(AtStep):
-    """Does something when the path has run for so many seconds of machine time."""
-
-    def __init__(self, plan: CampaignPlan, b: Bench, after_s: float, do: Callable[[], None], *, step: int | None = None) -> None:
-        super().__init__(step or number(plan, 0, RecordPath), lambda: None)
-        self._b, self._after_s, self._do_it = b, after_s, do
-        self._do = self._begin
-
-    def _begin(self) -> None:
-        self.waiting = asyncio.get_running_loop().create_task(self._when())
-
-    async def _when(self) -> None:
-        """Comes near in small steps: what a busy computer needs to notice must not be much of the path."""
-        self._b.sim.pace(self._b.sim.speed, STEP_S)
-        await self._on_path_for(self._after_s - 3.0)
-        self._b.sim.pace(2.0 if self._after_s < 1.0 else 10.0, STEP_S)
-        await self._on_path_for(self._after_s)
-        self._do_it()
-
-    async def _on_path_for(self, seconds: float) -> None:
-        controller = self._b.sim.world.controller
-        while seconds > 0.0 and not (controller.path_running and self._b.sim.world.time_s - controller.path_start_s >= seconds):  # noqa: ASYNC110 - simulated time
-            await asyncio.sleep(0.001)
 
 
 def estop(b: Bench) -> Callable[[], None]:
