@@ -23,6 +23,7 @@ from abbe.service.devices.session import Session, open_session
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.machine_text import machine_text
 from abbe.service.push.validate import PushLimits
+from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.recipes.recipe import CLEARANCE_MM
 from abbe.service.site import Site, machine_doc
@@ -56,6 +57,8 @@ MAX_SAMPLES_PER_S = 6000
 
 CERTIFICATES = {kind: date(2099, 12, 31) for kind in ("ballbar", "laser", "artefact")}
 """Last days of the certificates: far away, since simulated instruments need no calibration."""
+SIMULATED = Watching(unknown_s=5.0)
+"""A simulated controller is a program of this computer: while it waits for a core it is silent, and nothing moves."""
 FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Wide limits: the first table of an uncorrected machine changes every correction from zero to its full value."""
 
@@ -102,7 +105,8 @@ def bar_rate_hz(speed: float) -> int:
 def demo_site(simulator: SimulatorProcess) -> Site:
     """Return the site of a simulated machine: its nominal geometry and the addresses of its devices."""
     name, machine = "demo-machine", simulator.machine
-    return Site(name, machine, machine_doc(name, machine), simulator.urls, limits=FIRST_TABLE_LIMITS, calibrated_until=CERTIFICATES)
+    doc = machine_doc(name, machine)
+    return Site(name, machine, doc, simulator.urls, limits=FIRST_TABLE_LIMITS, watching=SIMULATED, calibrated_until=CERTIFICATES)
 
 
 def write_machine_file(site: Site, folder: Path) -> Path:

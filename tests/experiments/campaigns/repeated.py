@@ -16,7 +16,7 @@ import multiprocessing
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 
@@ -34,7 +34,6 @@ from abbe.service.sequences.recipes.campaigns import identification, verificatio
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
-from tests.faults.sequencer_world import PATIENT
 from tests.pretended import as_if_commissioned
 
 RATE_HZ = 10
@@ -121,7 +120,7 @@ async def rounds_of(seed: int, rounds: int, speed: float, folder: Path) -> list[
     out: list[Round] = []
     truth = await sealed_truth(machine, None)
     async with running_simulators([*machine, "--speed", f"{speed:g}", "--link-dir", str(folder)]) as simulator:
-        site = replace(demo_site(simulator), watching=PATIENT)
+        site = demo_site(simulator)
         with Store.open(f"sqlite:///{folder / 'abbe.sqlite3'}") as store:
             async with open_session(site.urls) as session:
                 await as_if_commissioned(session.controller, store, site)
