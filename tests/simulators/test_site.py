@@ -171,6 +171,24 @@ def test_a_reader_who_sleeps_finds_a_gap_marked_by_bit_2(start) -> None:
         assert not any(s[3] & 4 for s in samples[:marked])
 
 
+def controller_us(sim: Any) -> int:
+    return int(struct.unpack(">9xQ", exchange(sim.port("cnc"), bytes.fromhex("000700000006010300100004")))[0])
+
+
+def test_a_world_faster_than_real_time_waits_for_a_host_that_watches_it(start) -> None:
+    with start("--speed", "50") as sim, closing(Line(sim.path("ballbar"))) as line:
+        os.write(line.fd, START_1000)
+        line.read_until(lambda d: len(d) > 500)
+        before = controller_us(sim)
+        select.select([], [], [], 0.3)  # the host gets no core
+        assert 0 < controller_us(sim) - before <= 2_000_001, "2000 samples"
+        os.write(line.fd, STOP)
+        line.read_until(lambda d: frames(d)[-1][0] == 3)
+        before = controller_us(sim)
+        select.select([], [], [], 0.3)
+        assert controller_us(sim) - before >= 15_000_000, "nothing streams, so nobody is late"
+
+
 def test_ballbar_over_tcp(start) -> None:
     with start("--ballbar", "tcp") as sim:
         for _ in range(2):
