@@ -43,12 +43,16 @@ from abbe.service.storage.store import Store
 
 def bar_samples(chunks: Sequence[ChunkRecord]) -> BarSamples:
     """Unpack the samples of chunks ``bar/1`` in order; as `decode_bar`, but for millions of them. Raises StoreError."""
-    raw = b"".join(whole_samples(chunk.payload) for chunk in chunks)
+    raw = bytearray()
+    for chunk in chunks:
+        raw += whole_samples(chunk.payload)  # grows in place: a list of all chunks would take as much memory again
     return np.frombuffer(raw, BAR_SAMPLE)
 
 
-def load_run(store: Store, id_or_label: int | str) -> Run:
+def load_run(store: Store, id_or_label: int | str, *, full: bool = True) -> Run:
     """Read a run with its pieces and its artefact from the store; an incomplete one has a ``state`` (`abbe.service.runs.coverage`).
+
+    ``full`` False: the readings of a ball-bar path without their positions and without a ``state``, in half the time.
 
     Raises
     ------
@@ -58,18 +62,18 @@ def load_run(store: Store, id_or_label: int | str) -> Run:
         Its samples contradict its path, or its campaign does not describe its artefact.
     """
     record = store.runs.find(id_or_label)
-    run = whole_run(store, record)
+    run = whole_run(store, record, full=full)
     return run.with_artefact(store.campaigns.find(record.campaign_id).known) if run.is_artefact else run
 
 
-def whole_run(store: Store, record: RunRecord) -> Run:
-    """Return a run joined with its pieces, the interrupted runs whose path it resumed; raises like `load_run`."""
-    run = single_run(record, store.chunks.of_run(record.id))
+def whole_run(store: Store, record: RunRecord, *, full: bool = True) -> Run:
+    """Return a run joined with its pieces, the interrupted runs whose path it resumed; arguments and errors like `load_run`."""
+    run = single_run(record, store.chunks.of_run(record.id), full=full)
     pieces = record.start.pieces
     if not pieces:
-        return with_state(run, record)
+        return with_state(run, record) if full else run
     broken = [(store.runs.find(p.run), p.to_mm) for p in pieces]
-    earlier = [single_run(one, store.chunks.of_run(one.id)) for one, _ in broken]
+    earlier = [single_run(one, store.chunks.of_run(one.id), full=full) for one, _ in broken]
     parts = [counted_columns(record, one.columns, to_mm) for (record, to_mm), one in zip(broken, earlier, strict=True)]
     named = [{"run": one.label, "readings": len(part)} for (one, _), part in zip(broken, parts, strict=True)]
     timing = run.timing.document | {"pieces": named}
@@ -77,7 +81,8 @@ def whole_run(store: Store, record: RunRecord) -> Run:
     if troubles and not run.timing.trouble:
         timing["trouble"] = troubles[0]
     columns = Columns.concatenated([*parts, run.columns])
-    return with_state(replace(run, columns=columns, timing=RunTiming.from_document(timing)), record, broken[0][0].start)
+    joined = replace(run, columns=columns, timing=RunTiming.from_document(timing))
+    return with_state(joined, record, broken[0][0].start) if full else joined
 
 
 def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
@@ -106,8 +111,8 @@ def path_progress(store: Store, run: int) -> ReadProgress | None:
     return path_progress(store, earlier[-1].run) if earlier else None
 
 
-def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
-    """Return a run without its pieces, from all its chunks in order of seq within a channel.
+def single_run(record: RunRecord, chunks: Sequence[ChunkRecord], *, full: bool = True) -> Run:
+    """Return a run without its pieces, from all its chunks in order of seq within a channel; ``full`` as in `load_run`.
 
     Raises
     ------
@@ -121,7 +126,7 @@ def single_run(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Run:
         return replace(Run.from_document(imported), ended_utc=record.ended_utc or "")
     try:
         start = record.start
-        columns, timing = _measured(record, start, chunks)
+        columns, timing = _measured(record, start, chunks, full=full)
         _check_documents(record)
         return Run(
             campaign=record.campaign,
@@ -173,14 +178,14 @@ def unpack_columns(chunks: Sequence[ChunkRecord]) -> Doc:
     return {record["name"]: record["values"] for record in records}
 
 
-def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord]) -> tuple[Columns, Doc]:
+def _measured(record: RunRecord, start: RunStart, chunks: Sequence[ChunkRecord], *, full: bool) -> tuple[Columns, Doc]:
     """Return the columns and the ``timing`` document."""
     if record.test.startswith("ballbar") and not start.point_by_point:
         bar_chunks = _of(chunks, BAR_CHANNEL, BAR_CODEC)
         samples = bar_samples(bar_chunks)
         edges, complete = sync_edges(samples, start), record.status == "complete"
         clock = RunClock(1.0, 0.0, {}) if edges is None else run_clock(bar_chunks, record.end, edges)
-        return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate), clock.doc
+        return bar_columns(samples, start, record.end, complete=complete, rate=clock.rate, full=full), clock.doc
     setup = _setup(record)
     if isinstance(setup, ArtefactSetup):
         return touch_columns(_touches(chunks), start, setup.pose), {}

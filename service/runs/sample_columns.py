@@ -140,13 +140,36 @@ BAR_SAMPLE = np.dtype([("seq", "<u4"), ("device_us", "<u8"), ("reading_nm", "<i4
 BarSamples = npt.NDArray[np.void]
 
 
+BLOCK = 2**15
+"""Samples looked at together: their status fits into a processor's cache, and is mostly one and the same."""
+Rows = slice | npt.NDArray[np.intp]
+
+
 def _holds(samples: BarSamples, what: Callable[[int], bool]) -> npt.NDArray[np.bool_]:
-    """Return the mask of the samples whose status fulfils ``what``, which is called once for each different status."""
-    status = np.ascontiguousarray(samples["status"])
-    holds = np.zeros(2**16, dtype=np.bool_)
-    for kind in np.flatnonzero(np.bincount(status)):
-        holds[kind] = what(int(kind))
-    return np.asarray(holds[status], dtype=np.bool_)
+    """Return the mask of the samples whose status fulfils ``what``, which is called once for each different status of a block."""
+    holds = np.empty(len(samples), dtype=np.bool_)
+    kinds = np.zeros(2**16, dtype=np.bool_)
+    for begin in range(0, len(samples), BLOCK):
+        status = np.ascontiguousarray(samples["status"][begin : begin + BLOCK])
+        if status.min() == status.max():
+            holds[begin : begin + BLOCK] = what(int(status[0]))
+            continue
+        for kind in np.flatnonzero(np.bincount(status)):
+            kinds[kind] = what(int(kind))
+        holds[begin : begin + BLOCK] = kinds[status]
+    return holds
+
+
+def _ends(holds: npt.NDArray[np.bool_]) -> tuple[int, int] | None:
+    """Return the first and the last row for which a mask holds, None without any."""
+    first = int(np.argmax(holds)) if holds.size else 0
+    return (first, holds.size - 1 - int(np.argmax(holds[::-1]))) if holds.any() else None
+
+
+def _rows(holds: npt.NDArray[np.bool_]) -> Rows:
+    """Return the index of the rows for which a mask holds; a slice, which copies nothing, if they follow one another."""
+    first, last = _ends(holds) or (0, -1)
+    return slice(first, last + 1) if holds[first : last + 1].all() else np.flatnonzero(holds)
 
 
 def _follows(samples: BarSamples, k: int) -> bool:
@@ -156,22 +179,26 @@ def _follows(samples: BarSamples, k: int) -> bool:
 
 def sync_edges(samples: BarSamples, start: RunStart) -> Edges | None:
     """Return the edges of the sync line in a run; None if no sample has the line set."""
-    at = np.flatnonzero(_holds(samples, on_path))
-    if not at.size:
+    ends = _ends(_holds(samples, on_path))
+    if ends is None:
         return None
-    first, last = int(at[0]), int(at[-1])
+    first, last = ends
     device_us, whole = samples["device_us"], _follows(samples, first) and _follows(samples, last + 1)
     return Edges(int(device_us[first]), int(device_us[last]), 1.0 / start.rate_hz, whole)
 
 
 def starts_in_stream(samples: BarSamples) -> bool:
     """Whether the stream contains the sample just before the path. Then the path's start is known to one sample period."""
-    at = np.flatnonzero(_holds(samples, on_path))
-    first = int(at[0]) if at.size else 0
+    first, _ = _ends(_holds(samples, on_path)) or (0, 0)
     return first > 0 and (int(samples["seq"][first - 1]) + 1) % 2**32 == int(samples["seq"][first])
 
 
-def bar_columns(samples: BarSamples, start: RunStart, end: RunEnd, *, complete: bool = True, rate: float = 1.0) -> Columns:
+_FURTHER = {"device_seq": "seq", "device_us": "device_us", "status": "status"}
+
+
+def bar_columns(
+    samples: BarSamples, start: RunStart, end: RunEnd, *, complete: bool = True, rate: float = 1.0, full: bool = True
+) -> Columns:
     """Turn the samples of one path into columns.
 
     Parameters
@@ -186,6 +213,8 @@ def bar_columns(samples: BarSamples, start: RunStart, end: RunEnd, *, complete: 
         Whether the path ran to its end, so that durations can be checked.
     rate : float
         Seconds of the controller per second of the box (`abbe.service.runs.sample_columns`).
+    full : bool
+        Whether to give all columns; otherwise positions are NaN and there are no further columns, which take half the time.
 
     Returns
     -------
@@ -197,28 +226,27 @@ def bar_columns(samples: BarSamples, start: RunStart, end: RunEnd, *, complete: 
     MeasurementFault
         No sample lies on the path, or feed, path and duration contradict each other.
     """
-    path, rate_hz, feed_mm_s = start.commanded, start.rate_hz, start.commanded.feed_mm_s
-    at = np.flatnonzero(_holds(samples, on_path))
-    device_us = samples["device_us"][at].astype(np.int64)
+    path, rate_hz = start.commanded, start.rate_hz
+    feed_mm_s = path.feed_mm_s
+    rows = _rows(_holds(samples, on_path))
+    along, first = samples[rows], rows.start if isinstance(rows, slice) else int(rows[0])
+    device_us = along["device_us"].astype(np.int64)
     path_us = end.path_us if complete else None
     if path_us is not None:
         _check_durations(device_us, path_us, float(path.arc_mm[-1]) / feed_mm_s, rate_hz)
-    along_s = _time_along_path(samples, at, device_us, path_us, (rate_hz, rate))
-    counts = _counts(path, feed_mm_s * along_s)
-    along, device_us, along_s = samples[at[counts]], device_us[counts], along_s[counts]
+    along_s = _time_along_path(samples, first, device_us, path_us, (rate_hz, rate))
+    counts = _rows(_counts(path, feed_mm_s * along_s))
+    along, along_s = along[counts], along_s[counts]
     count = len(along)
+    further = {name: along[field].astype(np.int64) for name, field in _FURTHER.items()} if full else {}
     return Columns(
         t_s=_start_s(start, end) + along_s,
-        q_mm=_position(path.points_mm, feed_mm_s * along_s),
-        feed_mm_min=np.full(count, path.feed_mm_min),
-        direction=np.full(count, float(path.direction)),
+        q_mm=_position(path.points_mm, feed_mm_s * along_s) if full else np.broadcast_to(np.nan, (count, 3)),
+        feed_mm_min=np.broadcast_to(path.feed_mm_min, count),
+        direction=np.broadcast_to(float(path.direction), count),
         deviation_mm=along["reading_nm"] * 1e-6,
         valid=_holds(along, bar_is_valid),
-        further={
-            "device_seq": along["seq"].astype(np.int64),
-            "device_us": device_us,
-            "status": along["status"].astype(np.int64),
-        },
+        further=further,
     )
 
 
@@ -232,16 +260,15 @@ def _start_s(start: RunStart, end: RunEnd) -> float:
 
 def _time_along_path(
     samples: BarSamples,
-    at: npt.NDArray[np.intp],
+    first: int,
     device_us: npt.NDArray[np.int64],
     path_us: tuple[int, int] | None,
     rates: tuple[float, float],
 ) -> Array:
-    if not at.size:
+    if not device_us.size:
         return np.zeros(0)
     half_period_s = 0.5 / rates[0]
     since_first_s = (device_us - device_us[0]) * 1e-6 * rates[1]
-    first = int(at[0])
     seq, before = int(samples["seq"][first]), int(samples["seq"][first - 1])
     start_was_lost = seq != (before + 1) % 2**32 if first else seq != 0
     if start_was_lost and path_us is not None:
@@ -282,7 +309,10 @@ def _position(points: Array, arc_mm: Array) -> Array:
     steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
     corners = points[np.concatenate(([True], steps > 0.0))]  # repeated points would make the arc length ambiguous
     arc = np.concatenate(([0.0], np.cumsum(steps[steps > 0.0])))
-    return np.stack([np.interp(arc_mm, arc, corners[:, axis]) for axis in range(3)], axis=1)
+    out = np.empty((arc_mm.size, 3))
+    for axis in range(3):
+        out[:, axis] = np.interp(arc_mm, arc, corners[:, axis])
+    return out
 
 
 def bar_point_columns(records: Sequence[BarRecord], start: RunStart) -> Columns:

@@ -101,6 +101,7 @@ async def test_broken_twice_it_reads_what_it_reads_in_one_go(place):
     assert {r.start_doc["setup"]["setup_id"] for r in runs(store)} == {"S"}
     pieces = load_run(store, runs(store)[-1].id)
     assert [p.run for p in pieces.timing.pieces] == ["test", "test-2"]
+    assert np.array_equal(load_run(store, runs(store)[-1].id, full=False).columns.t_s, pieces.columns.t_s)
     whole_plan = replace(plan, name="whole")
     (whole_id,) = await measure(b.session, store, b.site, whole_plan)
     whole = load_run(store, whole_id)

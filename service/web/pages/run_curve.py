@@ -76,9 +76,13 @@ def _overview(store: Store, number: int, samples: int) -> _Overview:
 @lru_cache(1)
 def _readings(store: Store, number: int, _samples: int) -> tuple[F1, F1]:
     """The valid readings of the run on the screen, cached until it has more samples."""
-    columns = load_run(store, number).columns
+    columns = load_run(store, number, full=False).columns
     deviation_mm = np.empty(0) if columns.deviation_mm is None else columns.deviation_mm
     t_s = columns.t_s[: deviation_mm.size]
     good = columns.valid[: deviation_mm.size] & np.isfinite(deviation_mm)
-    order = np.argsort(t_s[good], kind="stable")
-    return t_s[good][order], deviation_mm[good][order]
+    if not good.all():
+        t_s, deviation_mm = t_s[good], deviation_mm[good]
+    if (t_s[1:] < t_s[:-1]).any():
+        order = np.argsort(t_s, kind="stable")
+        t_s, deviation_mm = t_s[order], deviation_mm[order]
+    return t_s, deviation_mm

@@ -49,7 +49,10 @@ def stored(
         store.chunks.append(run_id, "bar", number, len(part), BAR_CODEC, encode_bar(part), 0.0, 0.0, part[0].device_us, part[-1].device_us)
     if end is not None or status != "running":
         store.runs.finish(run_id, status, "", end)
-    return load_run(store, run_id).to_document()
+    run, curve = load_run(store, run_id), load_run(store, run_id, full=False).columns
+    for name in ("t_s", "deviation_mm", "valid"):
+        assert np.array_equal(getattr(curve, name), getattr(run.columns, name)), "the same readings without positions"
+    return run.to_document()
 
 
 END = {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + PATH_US}
@@ -92,6 +95,17 @@ def test_flagged_readings_are_not_valid(store: Store, campaign_id: int) -> None:
         samples[at] = BarSample(old.seq, old.device_us, old.reading_nm, old.status | 1 << bit)
     valid = stored(store, campaign_id, samples, END)["columns"]["valid"]
     assert [index + 20 for index, value in enumerate(valid) if not value] == [100, 300, 400]
+
+
+def test_a_sample_in_between_without_the_sync_line_is_left_out(store: Store, campaign_id: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("abbe.service.runs.sample_columns.BLOCK", 64)
+    samples = stream(phase_us=500)
+    for at, status in ((400, 0), (500, SYNC | 1)):
+        samples[at] = samples[at]._replace(status=status)
+    columns = stored(store, campaign_id, samples, END)["columns"]
+    assert columns["device_seq"] == [seq for seq in range(20, 1020) if seq != 400]
+    assert [seq for seq, valid in zip(columns["device_seq"], columns["valid"], strict=True) if not valid] == [500]
+    assert np.allclose(np.array(columns["t_s"]) - 3.0, columns["deviation_mm"], atol=1e-9)
 
 
 def test_lost_samples_shift_nothing(store: Store, campaign_id: int) -> None:
