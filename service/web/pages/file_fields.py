@@ -14,11 +14,15 @@ from typing import Any, Literal
 from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
 from abbe.service.web.frame import current
 
-Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many"]
-"""``optional``: a text, ``maybe``: a number, that may be absent; ``range``: two numbers; ``yes``: yes or no; ``many``: boxes to tick."""
+Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many", "times"]
+"""``optional``: a text, ``maybe``: a number, that may be absent; ``range``: two numbers; ``yes``: yes or no; ``many``: boxes to tick;
+``times``: days and a time of day, or a cron expression."""
 _NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
 _KEY = re.compile(r"\b(issuer|item|verify|limits|calibration|schedule)(?:\[([^\]]*)\])?(\.[a-z_.]*[a-z_])")
 ENDS = ("low", "high")
+DAYS = {"daily": "*", "workdays": "1-5", "mon": "1", "tue": "2", "wed": "3", "thu": "4", "fri": "5", "sat": "6", "sun": "0"}
+"""Days of a schedule as they are chosen, and as a cron expression has them."""
+_ONE_TIME = re.compile(r"(\d|[1-5]\d) (\d|1\d|2[0-3]) \* \* (\*|1-5|[0-6])")
 
 
 @dataclass(frozen=True, slots=True)
@@ -73,7 +77,7 @@ LABORATORY, LIMITS = (*ISSUER, *ITEM), (*VERIFY, *PUSH, *MEASURE)
 SCHEDULE = (
     Field("name", "text", required=True),
     Field("recipe", "choice"),
-    Field("cron", "optional"),
+    Field("cron", "times", ("expression", *DAYS)),
     Field("every_h", "maybe"),
     Field("first", "optional"),
     Field("timezone", "text", required=True),
@@ -86,7 +90,14 @@ SCHEDULE = (
     Field("needs.operator", "choice", ("any", "present", "absent")),
 )
 """Fields of one schedule; their keys follow ``schedule[N].``."""
-SCHEDULE_DEFAULTS = {"timezone": "UTC", "recipe": "quick-check", "catch_up": "skip", "on_alarm": "none", "needs.operator": "any"}
+SCHEDULE_DEFAULTS = {
+    "cron": "0 6 * * *",
+    "timezone": "UTC",
+    "recipe": "quick-check",
+    "catch_up": "skip",
+    "on_alarm": "none",
+    "needs.operator": "any",
+}
 
 
 def schedule_fields(number: int, recipes: Sequence[str]) -> tuple[Field, ...]:
@@ -97,8 +108,8 @@ def schedule_fields(number: int, recipes: Sequence[str]) -> tuple[Field, ...]:
 
 @dataclass(frozen=True, slots=True)
 class ShownField:
-    """A field with its value as the form shows it. ``texts``: one text, or the two ends of a range, or what is ticked; ``fixed``: the
-    environment of the service sets the value."""
+    """A field with its value as the form shows it. ``texts``: one text, or the two ends of a range, or what is ticked, or days, time and
+    expression; ``fixed``: the environment of the service sets the value."""
 
     field: Field
     texts: tuple[str, ...]
@@ -121,9 +132,9 @@ def shown_fields(fields: Sequence[Field], stated: MachineFileSummary) -> list[Sh
     found = []
     for field in fields:
         one = known.get(field.key)
-        blank = one is None or (one.origin == "default" and field.kind in {"optional", "maybe"})
+        blank = one is None or (one.origin == "default" and field.kind in {"optional", "maybe", "times"})
         value = None if one is None or blank else json.loads(one.value)
-        if value is None:
+        if value is None and (one is None or field.kind != "times"):
             value = SCHEDULE_DEFAULTS.get(field.key.partition("].")[2])
         found.append(ShownField(field, _texts(field, value), one is not None and one.origin == "environment"))
     return found
@@ -132,9 +143,27 @@ def shown_fields(fields: Sequence[Field], stated: MachineFileSummary) -> list[Sh
 def _texts(field: Field, value: Any) -> tuple[str, ...]:
     if value is None and field.kind == "range":
         return ("", "")
+    if field.kind == "times":
+        return _times(value or "")
     if isinstance(value, list):
         return tuple(_text(one) for one in value)
     return ("" if value is None else _text(value),)
+
+
+def _times(cron: str) -> tuple[str, str, str]:
+    """A cron expression in a form: as chosen days and a time of day, or as it is."""
+    found = _ONE_TIME.fullmatch(cron)
+    if found is None:
+        return "expression", "06:00", cron
+    days = next(name for name, known in DAYS.items() if known == found[3])
+    return days, f"{int(found[2]):02}:{int(found[1]):02}", ""
+
+
+def _cron(days: str, time: str, expression: str) -> str | None:
+    if days not in DAYS:
+        return expression or None
+    hour, _, minute = time.partition(":")
+    return f"{minute.removeprefix('0') or 0} {hour.removeprefix('0') or 0} * * {DAYS[days]}"
 
 
 def _text(value: Any) -> str:
@@ -184,6 +213,8 @@ def _sent(field: Field, form: Mapping[str, str]) -> Any:
             return None if low is None and high is None else [low, high]
         case "many":
             return [one for one in field.options if form.get(f"{field.key}.{one}") == "yes"]
+        case "times":
+            return _cron(form.get(f"{field.key}.days", ""), form.get(f"{field.key}.time", ""), text)
         case "date" | "optional":
             return text or None
     return text

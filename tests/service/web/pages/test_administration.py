@@ -53,6 +53,8 @@ def sent(some: Any, known: MachineFileSummary) -> dict[str, str]:
             form |= {f"{one.field.key}.{end}": text for end, text in zip(fields.ENDS, one.texts, strict=True)}
         elif one.field.kind == "many":
             form |= {one.field.key: "shown", **{f"{one.field.key}.{text}": "yes" for text in one.texts if text}}
+        elif one.field.kind == "times":
+            form |= {f"{one.field.key}.days": one.texts[0], f"{one.field.key}.time": one.texts[1], one.field.key: one.texts[2]}
         else:
             form[one.field.key] = one.texts[0]
     return form
@@ -109,8 +111,15 @@ def test_untouched_forms_ask_for_nothing() -> None:
         ),
         (
             schedule_fields(1, ()),
-            {"schedule[1]__every_h": "24", "schedule[1]__cron": ""},
+            {"schedule[1]__every_h": "24", "schedule[1]__cron__days": "expression"},
             {"schedule[1].cron": "null", "schedule[1].every_h": "24"},
+        ),
+        (schedule_fields(1, ()), {"schedule[1]__cron__days": "workdays"}, {"schedule[1].cron": '"0 6 * * 1-5"'}),
+        (schedule_fields(1, ()), {"schedule[1]__cron__time": "00:05"}, {"schedule[1].cron": '"5 0 * * 1"'}),
+        (
+            schedule_fields(1, ()),
+            {"schedule[1]__cron__days": "expression", "schedule[1]__cron": "0 6 1 * *"},
+            {"schedule[1].cron": '"0 6 1 * *"'},
         ),
     ],
 )
@@ -118,9 +127,15 @@ def test_a_form_asks_for_what_differs(some: Any, changes: dict[str, str], expect
     assert asked(some, **changes) == expected
 
 
+@pytest.mark.parametrize("times", ['cron = "00 06 * * 1"', 'cron = "0 6 1 * *"', "every_h = 8.0", 'cron = "59 23 * * 0"'])
+def test_an_untouched_schedule_keeps_its_times(times: str) -> None:
+    known = stated(WHOLE.replace('cron = "0 6 * * 1"', times))
+    assert edits_of(schedule_fields(1, ()), sent(schedule_fields(1, ()), known), known) == ()
+
+
 def test_a_new_schedule_and_a_first_laboratory_are_valid_files() -> None:
     known, plan = stated(TEXT), schedule_fields(1, ("quick-check",))
-    form = sent(plan, known) | {"schedule[1].name": "night", "schedule[1].cron": "0 2 * * *"}
+    form = sent(plan, known) | {"schedule[1].name": "night", "schedule[1].cron.time": "02:00"}
     loaded = parse_machine(PATH, TEXT.encode())
     entry = changed(loaded, edits_of(plan, form, known)).machine.schedule[0]
     assert entry == Schedule("night", "0 2 * * *")
