@@ -67,6 +67,11 @@ class ModbusTcp:
         listener = self._server.transport
         return int(listener.sockets[0].getsockname()[1]) if isinstance(listener, asyncio.Server) else port
 
+    @property
+    def connected(self) -> bool:
+        """Whether any host is connected."""
+        return self._server is not None and bool(self._server.active_connections)
+
     async def stop(self) -> None:
         """Close the listener and its connections."""
         if self._server is not None:

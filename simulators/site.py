@@ -59,8 +59,8 @@ BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 class Site:
     """All connections of one simulated world. Simulated time = speed x wall time since ``start``.
 
-    A world that is faster than real time waits for its host: while samples stream and the host has asked the controller, it runs on for
-    `AHEAD_S` at most until the next question. At 60 times, a host that gets no core for 0.4 s would be 24 s late.
+    A world that is faster than real time waits for its host: while samples stream and a connected host has asked the controller, it runs
+    on for `AHEAD_S` at most until the next question. At 60 times, a host that gets no core for 0.4 s would be 24 s late.
     """
 
     def __init__(self, scenario: Scenario, link_dir: Path | None = None) -> None:
@@ -131,7 +131,7 @@ class Site:
     def _advance(self) -> None:
         now_s, rate_hz = asyncio.get_running_loop().time(), self.world.ballbar.rate_hz
         due_s = self._at_s + self._scenario.speed * (now_s - self._last_s)
-        if not rate_hz:
+        if not (rate_hz and self._cnc.connected):
             self._asked_s = None
         elif self._asked_s is not None and self._scenario.speed > 1.0:
             due_s = min(due_s, max(self._at_s, self._asked_s + min(AHEAD_S, AHEAD_SAMPLES / rate_hz)))

@@ -23,7 +23,7 @@ from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import PATIENT
 from tests.scenarios.conftest import ABBE, Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
-from tests.scenarios.world import position_and_counters, refused, registers, runs_of, wait_for
+from tests.scenarios.world import axes_at_rest, position_and_counters, refused, registers, runs_of, wait_for
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
 
@@ -111,6 +111,7 @@ def killed(identified, tmp_path_factory) -> Killed:
     wait_for(lambda: verifying(identified), 90, "the verification of the new table")
     process.kill()
     process.wait()
+    wait_for(lambda: axes_at_rest(identified), 60, "the end of the motion that was under way")
     left = tmp_path_factory.mktemp("left") / "abbe.sqlite3"
     copied(folder / "abbe.sqlite3", left)
     return Killed(identified, before, table(identified), left)
