@@ -176,10 +176,13 @@ class RecordMapping(Generic[R]):
         self._fields = {name: other[name] if name in other else table.c[name] for name in names}
         kinds = get_type_hints(record)
         self._enums = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, StrEnum)}
-        nested = {name for name, column in self._fields.items() if isinstance(column, RecordMapping)}
+        self._nested = {name: column for name, column in self._fields.items() if isinstance(column, RecordMapping)}
+        self._labels = {name: self._prefix + name for name in names if name not in self._nested}
         self._documents = {
-            name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind) and name not in nested
+            name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind) and name not in self._nested
         }
+
+        self._plain = not (self._nested or self._enums or self._documents or any(one.kw_only for one in fields(record)))
 
     @property
     def columns(self) -> list[ColumnElement[Any]]:
@@ -195,14 +198,15 @@ class RecordMapping(Generic[R]):
 
     def read(self, row: Row[*tuple[Any, ...]]) -> R:
         """The record of a row that holds `columns` and possibly others."""
+        if self._plain and len(row) == len(self._labels):
+            return self._make(*row)  # in the order of the fields; a long run has a hundred thousand chunks
         return self.from_values(row._mapping)  # noqa: SLF001 - SQLAlchemy's public name
 
     def from_values(self, values: Mapping[Any, Any]) -> R:
         """The record made from values, given by the labels of `columns`."""
-        found = {
-            name: column.from_values(values) if isinstance(column, RecordMapping) else values[self._prefix + name]
-            for name, column in self._fields.items()
-        }
+        found = {name: values[label] for name, label in self._labels.items()}
+        for name, mapping in self._nested.items():
+            found[name] = mapping.from_values(values)
         for name, kind in self._enums.items():
             found[name] = kind(found[name])
         for name, document_kind in self._documents.items():
