@@ -1,6 +1,6 @@
 """What every test gets: the shared material, a way to demand a tool, and guards against what a test must not leave behind or reach.
 
-``ABBE_TEST_REQUIRE`` is a comma list of things that have to be there (``chromium,mosquitto,socat,mbpoll,libmodbus,postgresql,rs274,
+``ABBE_TEST_REQUIRE`` is a comma list of things that have to be there (``chromium,mosquitto,socat,mbpoll,qpdf,libmodbus,postgresql,rs274,
 linuxcnc,shared``).
 A test that misses one of them fails; without the variable it is skipped and says why.
 """

@@ -7,7 +7,7 @@ import os
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from importlib.resources import files
 from pathlib import Path
 from typing import Any
@@ -60,8 +60,10 @@ def document_html(document: Document) -> str:
 
 
 def document_pdf(document: Document) -> bytes:
-    """The report as PDF (A4, tagged), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
+    """The report as PDF (A4), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
 
+    It conforms to PDF/UA-1 (ISO 14289-1) and, if a day is on record, to PDF/A-2a (ISO 19005-2); typst checks both. With a letter that no
+    font prints it is neither.
     Chinese, Japanese and Korean letters need a font of the computer. Without such a font the report is in English and says
     so; it also says which names it cannot print.
     """
@@ -70,7 +72,7 @@ def document_pdf(document: Document) -> bytes:
     known, remark = {lang: font_folders(lang) for lang in FONTS_OF}, ""
     if document.lang in known and not known[document.lang]:
         remark, document = IN_ENGLISH.format(lang=document.lang), replace(document, lang=ENGLISH)
-    data: dict[str, Any] = shown(document, standalone) | {"font": FONT}
+    data: dict[str, Any] = shown(document, standalone) | {"font": FONT, "day": document.issued or (document.days or ("",))[-1]}
     folders = [*dict.fromkeys(folder for found in known.values() for folder in found)]
     text = json.dumps(data, ensure_ascii=False)
     if _EAST.search(text):
@@ -83,7 +85,11 @@ def document_pdf(document: Document) -> bytes:
     template = files("abbe.service.rendering").joinpath("templates", "document.typ").read_bytes()
     inputs = {"data": json.dumps(data, ensure_ascii=False)}
     fonts = typst.Fonts(include_system_fonts=False, font_paths=folders)
-    made = typst.compile(template, format="pdf", font_paths=fonts, sys_inputs=inputs)
+    set_by = partial(typst.compile, template, format="pdf", font_paths=fonts, sys_inputs=inputs)
+    try:
+        made = set_by(pdf_standards=["a-2a", "ua-1"] if data["day"] else ["ua-1"])
+    except typst.TypstError:
+        made = set_by()
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
 

@@ -3,6 +3,9 @@
 import csv
 import io
 import json
+import re
+import shutil
+import subprocess
 import xml.etree.ElementTree as ET
 
 import numpy as np
@@ -49,7 +52,7 @@ def test_hostile_words_stay_words_on_page_and_paper():
     assert "a\ufffdb\ufffdc" in page
 
 
-def test_the_pdf_brings_its_own_fonts_has_tags_no_date_and_no_link():
+def test_the_pdf_brings_its_own_fonts_has_tags_and_no_link():
     reader = pypdf.PdfReader(io.BytesIO(document_pdf(document(appendix=[Section("P", [PictureBlock("circle", [polar()])])]))))
     fonts = {str(f["/BaseFont"]).split("+")[-1] for p in reader.pages for f in (v.get_object() for v in p["/Resources"]["/Font"].values())}
     assert fonts
@@ -57,8 +60,40 @@ def test_the_pdf_brings_its_own_fonts_has_tags_no_date_and_no_link():
     root = reader.trailer["/Root"]
     assert root["/MarkInfo"]["/Marked"]
     assert "circle" in json.dumps([str(e) for e in alternatives(root["/StructTreeRoot"])])
-    assert (reader.metadata.creation_date, reader.metadata.title) == (None, "Campaign a")
+    assert reader.metadata.title == "Campaign a"
     assert all("/Annots" not in p for p in reader.pages)
+
+
+def test_a_dated_report_is_an_archivable_accessible_pdf_that_others_find_whole(tmp_path, require):
+    require("qpdf", shutil.which("qpdf") is not None, "qpdf is not installed")
+    made = document_pdf(document(days=("2026-11-27", "2026-11-28"), appendix=[Section("P", [PictureBlock("circle", [polar()])])]))
+    (tmp_path / "report.pdf").write_bytes(made)
+    found = subprocess.run(["qpdf", "--check", tmp_path / "report.pdf"], capture_output=True, text=True, check=False)
+    assert (found.returncode, found.stderr) == (0, ""), found.stdout
+    reader = pypdf.PdfReader(io.BytesIO(made))
+    assert declared(reader) == {"pdfaid:part": "2", "pdfaid:conformance": "A", "pdfuaid:part": "1"}
+    assert reader.metadata.creation_date.date().isoformat() == "2026-11-28"
+    root = reader.trailer["/Root"]
+    assert [str(one["/S"]) for one in root["/OutputIntents"]] == ["/GTS_PDFA1"]
+    assert not {"/AA", "/OpenAction", "/AcroForm", "/JavaScript"} & (set(root) | set(root.get("/Names", {})))
+    fonts = [font.get_object() for page in reader.pages for font in page["/Resources"]["/Font"].values()]
+    assert all(
+        "/FontFile3" in of["/FontDescriptor"] or "/FontFile2" in of["/FontDescriptor"] for f in fonts for of in f["/DescendantFonts"]
+    )
+    assert all("/ToUnicode" in f for f in fonts)
+
+
+def test_a_report_without_a_day_is_accessible_and_one_with_a_letter_of_no_font_claims_nothing(monkeypatch):
+    assert declared(pypdf.PdfReader(io.BytesIO(document_pdf(document())))) == {"pdfuaid:part": "1"}
+    monkeypatch.setattr(document_page, "FONTS", ())
+    monkeypatch.delenv("ABBE_FONTS", raising=False)
+    assert declared(pypdf.PdfReader(io.BytesIO(document_pdf(document(title="基準"))))) == {}
+
+
+def declared(reader: pypdf.PdfReader) -> dict[str, str]:
+    """The standards of which a PDF says that it keeps them."""
+    metadata = reader.trailer["/Root"]["/Metadata"].get_object().get_data().decode()
+    return dict(re.findall(r"<(pdfu?aid:(?:part|conformance))>(\w+)<", metadata))
 
 
 def alternatives(node) -> list[str]:

@@ -74,6 +74,7 @@ def test_a_pdf_says_what_its_data_say_and_has_letters_for_it(lang: str, reports:
         assert re.search(LETTERS[lang], text), name
         assert words(text) - words(" ".join(texts(shown(own)))) == set(), name
         assert reader.trailer["/Root"]["/Lang"] == lang
+        assert b"<pdfuaid:part>1<" in reader.trailer["/Root"]["/Metadata"].get_object().get_data(), name  # it has every letter
 
 
 @pytest.mark.parametrize("lang", OTHERS)
