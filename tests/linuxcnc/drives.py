@@ -1,20 +1,15 @@
 #!/usr/bin/python3
 """Runs beside the control, with its Python: tells what the drives get. One line in, one answer on stdout.
 
-``get NAME...``: the values of HAL items. ``path``: waits for the path output and, as long as it is on, takes joint commands and drive
-commands of one instant; answers with the number of rows and then the rows, X Y Z of the command and X Y Z of the drives in mm.
+``get NAME...``: the values of HAL items. ``rows``: what `SAMPLER` of instance.py has taken in every servo period with the path output on,
+since the last ``rows``: their number and then the rows, X Y Z of the command and X Y Z of the drives in mm.
 """
 
-import signal
 import sys
-import time
 
 import hal
 
-COMMANDS = [f"joint.{n}.pos-cmd" for n in range(3)]
-DRIVES = [f"drive-{a}" for a in "xyz"]
-PERIOD_S = 0.003
-PATIENCE_S = 20.0
+SHAPE = "ffffff"
 
 
 def values(names):
@@ -22,20 +17,16 @@ def values(names):
 
 
 def rows():
-    """Rows whose values did not change while they were read: the servo thread does not wait for us."""
     found = []
-    begin = time.monotonic()
-    while not hal.get_value("abbe-path.out") and time.monotonic() < begin + PATIENCE_S:
-        signal.sigtimedwait([], PERIOD_S)
-    while hal.get_value("abbe-path.out"):
-        once, again = values(COMMANDS + DRIVES), values(COMMANDS + DRIVES)
-        if once == again:
-            found.append(once)
-        signal.sigtimedwait([], PERIOD_S)
+    while samples.readable:
+        found.append(samples.read())
+    if samples.num_overruns:
+        sys.exit("the sampler's memory was too small")
     return found
 
 
 component = hal.component("drives-probe")
+samples = hal.stream(component, hal.sampler_base, SHAPE)
 component.ready()
 for line in sys.stdin:
     what, *names = line.split()

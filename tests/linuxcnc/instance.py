@@ -20,6 +20,19 @@ ROOT = Path(__file__).resolve().parents[2]
 DEPLOY = ROOT / "deploy" / "linuxcnc"
 DRIVES = Path(__file__).with_name("drives.py")
 PATIENCE_S = 60.0
+SAMPLER = """
+loadrt sampler depth=32768 cfg=ffffff
+net abbe-cmd-x => sampler.0.pin.0
+net abbe-cmd-y => sampler.0.pin.1
+net abbe-cmd-z => sampler.0.pin.2
+net drive-x => sampler.0.pin.3
+net drive-y => sampler.0.pin.4
+net drive-z => sampler.0.pin.5
+net abbe-path-running => sampler.0.enable
+addf sampler.0 servo-thread
+"""
+"""Commands and drive commands of one instant, in every servo period of a path. A program that looks now and then sees few of them, and on
+a busy computer fewer."""
 
 
 def missing() -> str:
@@ -48,6 +61,7 @@ class Instance:
         begin = time.monotonic()
         (self.run / "ready").unlink(missing_ok=True)
         (self.run / "bridge.log").write_text("")
+        (self.run / "drives.hal").write_text((DEPLOY / "drives.hal").read_text() + SAMPLER)
         fd = self.listening.fileno()
         self._process = await asyncio.create_subprocess_exec(
             # whatever becomes of us, it does not outlive us
@@ -85,8 +99,8 @@ class Instance:
         return x, y, z
 
     async def path_rows(self) -> list[list[float]]:
-        """Commands and drive commands along the path that is started while this waits."""
-        return await self._ask("path", 0)
+        """Commands and drive commands on all paths since the last call. The bridge ends a path some looks after the axes stand."""
+        return await self._ask("rows", 0)
 
     async def _ask(self, line: str, n_lines: int) -> list[list[float]]:
         assert self._drives is not None

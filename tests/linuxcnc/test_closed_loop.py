@@ -35,6 +35,7 @@ from tests.linuxcnc.instance import Instance
 from tests.linuxcnc.test_control import OWNER, controller, push, until
 from tests.linuxcnc.test_files import settled
 from tests.models.solvers.truth import FLOOR, MACHINE, PLACES, SIGMA, Truth
+from tests.patience import within
 
 COUNTS = (13, 11, 10)
 LSB_MM = 1e-4
@@ -55,23 +56,19 @@ class Behind:
 
     def __init__(self, machine: Instance, cnc: ModbusController, truth: Truth) -> None:
         self.machine, self.cnc, self.truth = machine, cnc, truth
-        self.usable, self.least_rows = 1.0, 10**9
+        self.least_rows = 10**9
 
     async def along(self, path: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Run a path; commands and true tool positions at instants on it, lost motion by the direction of each axis."""
         await self.cnc.move(tuple(np.round(path[0], 5)), feed_mm_min=FEED, timeout_s=30)
         await self.cnc.load_path([tuple(np.round(p, 5)) for p in path[1:]])
-        recording = asyncio.create_task(self.machine.path_rows())
+        await self.machine.path_rows()  # a period or two after the end of the path before
         await self.cnc.start_path(feed_mm_min=FEED)
-        rows = np.array(await recording)
         await until(self.cnc, lambda s: Condition.PATH_RUNNING not in s.conditions)
-        # No table yet: what is not equal was taken in the middle of a servo period, which another process may stretch.
-        same = np.abs(rows[:, 3:] - rows[:, :3]).max(axis=1) < 1e-9
-        self.usable = min(self.usable, float(same.mean()))
-        self.least_rows = min(self.least_rows, int(same.sum()))
-        assert same.mean() > 0.8
-        rows = rows[same]
+        rows = np.array(await self.machine.path_rows())
+        assert np.abs(rows[:, 3:] - rows[:, :3]).max() < 1e-9  # no table yet
         rows = rows[np.r_[True, np.linalg.norm(np.diff(rows[:, :3], axis=0), axis=1) > 0.05]]
+        self.least_rows = min(self.least_rows, len(rows))
         command, drive = rows[:, :3], rows[:, 3:]
         return command, drive + self.truth.deviation(drive, travel_sign(command))
 
@@ -207,7 +204,6 @@ async def volumetric(machine: Instance) -> dict[str, float]:
         pushed = time.monotonic()
         after = field_statistics(points, await behind.deviation(points)).rms_mm
     return {
-        "rows_usable": behind.usable,
         "rows_least": behind.least_rows,
         "measured_s": measured - begin,
         "solved_s": solved - measured,
@@ -277,4 +273,4 @@ async def test_identify_push_and_verify_on_two_controls_at_once(instances, recor
     for axis in "XYZ":
         assert files[f"{axis}_interpolation_um"] > 0.1  # the table's points do cost something: this is not rounding alone
         assert files[f"{axis}_after_um"] < files[f"{axis}_before_um"] / 5
-    assert whole_s < WHOLE_S
+    assert whole_s < within(WHOLE_S)

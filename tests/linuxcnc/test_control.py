@@ -116,13 +116,13 @@ async def test_it_is_one_of_ours_moves_and_runs_a_path(machine):
             await cnc.move((700.0, 0.0, 0.0), feed_mm_min=FEED, timeout_s=20)
         path = [(300.0 + n, 100.0 + n / 2, 50.0) for n in range(1, 101)]
         await cnc.load_path(path)
-        recording = asyncio.create_task(machine.path_rows())
+        assert await machine.path_rows() == []
         await cnc.start_path(feed_mm_min=3000)
         assert Condition.PATH_RUNNING in (await cnc.status()).conditions
         await until(cnc, lambda s: 0 < s.path_points_done < 100)
         await until(cnc, lambda s: Condition.PATH_RUNNING not in s.conditions)
         end = await cnc.status()
-        rows = await recording
+        rows = await machine.path_rows()
         assert end.path_points_done == 100
         assert end.position_mm == path[-1]
         length = sum((b - a) ** 2 for a, b in zip((300.0, 100.12345, 50.0), path[-1], strict=True)) ** 0.5
