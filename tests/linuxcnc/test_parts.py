@@ -17,7 +17,7 @@ from tests.linuxcnc.instance import DEPLOY
 @pytest.fixture
 def bridge(monkeypatch):
     """The bridge's modules, imported as its own process does."""
-    names = ("network", "image", "files", "banks", "modbus")
+    names = ("network", "image", "files", "banks", "modbus", "motion")
     monkeypatch.syspath_prepend(str(DEPLOY))
     yield SimpleNamespace(**{name: importlib.import_module(name) for name in names})
     for name in names:
@@ -198,3 +198,63 @@ def test_modbus_requests_are_answered_or_refused(bridge, request_, reply):
             return address + len(words) <= 10
 
     assert bridge.modbus.answer(Ten(), bytes.fromhex(request_)) == bytes.fromhex(reply)
+
+
+class Idle:
+    """A control that stands still and does nothing: what a line that it has just accepted looks like until its servo thread runs."""
+
+    low_mm, high_mm = (0.0,) * 3, (600.0,) * 3
+
+    def __init__(self) -> None:
+        quiet = ("estop", "interpreting", "spindle", "door_open", "probe_ready", "deflected", "tripped")
+        ready = ("drives_on", "homed", "ready", "in_position", "remote")
+        self.shown = SimpleNamespace(**dict.fromkeys(quiet, False), **dict.fromkeys(ready, True), position_mm=(0.0,) * 3, queue=0, line=0)
+
+    def snapshot(self) -> SimpleNamespace:
+        return SimpleNamespace(**vars(self.shown))
+
+    def shows(self, **state) -> None:
+        vars(self.shown).update(state)
+
+    def nothing(self, *_: object, **__: object) -> None:
+        return None
+
+    hold = path_output = complaints = mdi = abort = nothing
+
+
+@pytest.fixture
+def moved(bridge, tmp_path):
+    """A motion that has been commanded, its control, and the clock, us."""
+    control, clock = Idle(), [1]
+    motion = bridge.motion.Motion(control, lambda: clock[0], tmp_path / "path.ngc")
+    assert motion.move((10.0, 0.0, 0.0), 1000.0) == bridge.motion.Result.OK
+    return motion, control, clock
+
+
+def test_a_motion_is_not_over_before_the_servo_thread_has_begun_it(moved):
+    motion, control, clock = moved
+    for _ in range(5):
+        clock[0] += 20_000
+        motion.tick()
+        assert motion.moving
+    control.shows(ready=False, in_position=False, queue=1)
+    motion.tick()
+    control.shows(ready=True, in_position=True, queue=0, position_mm=(10.0, 0.0, 0.0))
+    motion.tick()
+    assert (motion.moving, motion.done) == (False, 1)
+
+
+def test_a_line_that_the_control_refuses_ends_and_counts_for_nothing(moved):
+    motion, _, clock = moved
+    for _ in range(3):
+        clock[0] += 150_000
+        motion.tick()
+    assert (motion.moving, motion.done) == (False, 0)
+
+
+def test_an_aborted_motion_is_over_at_once(moved, bridge):
+    motion, _, clock = moved
+    motion.request_hold(bridge.motion.Hold.ABORT)
+    clock[0] += 1
+    motion.tick()
+    assert (motion.moving, motion.done) == (False, 1)
