@@ -337,7 +337,7 @@ class Chunks(Repository):
         query = (
             CHUNK.select().where(chunks.c.run_id == run_id, *if_given(chunks.c.channel, channel)).order_by(chunks.c.channel, chunks.c.seq)
         )
-        found = [CHUNK.read(row) for row in self._db.read(lambda connection: connection.execute(query).all())]
+        found = self._db.read(lambda connection: [CHUNK.read(row) for row in connection.execute(query)])
         for chunk in found:
             if zlib.crc32(chunk.payload) != chunk.crc32:
                 raise StoreError(

@@ -2,6 +2,7 @@
 
     python -m tests.experiments.campaigns.plots                 # prints the figures with the load of this computer
     taskset -c 0 python -m tests.experiments.campaigns.plots    # server and browser share one core
+    python -m tests.experiments.campaigns.plots --chunk 16      # a run in chunks of 16 ms, about the smallest that capture writes
 
 First: from the start of the navigation until the curve stands, the first time (the service reads the run from its database) and again;
 and the processor time of service and page's thread until then, which other programs do not lengthen.
@@ -19,12 +20,14 @@ import statistics
 import tempfile
 import time
 import zlib
+from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import numpy as np
 from playwright.sync_api import Browser, Page
 
+from abbe.service.domain.measured import ChunkRecord
 from abbe.service.domain.schedule import Schedule
 from abbe.service.runs.chunks import BAR_CODEC
 from abbe.service.storage.store import Store
@@ -54,11 +57,11 @@ FRAMES = """() => new Promise((done) => {
   };
   requestAnimationFrame(frame);
 })"""
-PLOTTED = """() => document.documentElement.dataset.plotted && document.querySelector('[data-part=main] canvas')
+PLOTTED = """() => document.documentElement?.dataset.plotted && document.querySelector('[data-part=main] canvas')
   && performance.mark("the curve stands").startTime"""
 
 
-def fill(folder: Path, checks: int, readings: int = READINGS) -> Filled:
+def fill(folder: Path, checks: int, readings: int = READINGS, chunk: int = CHUNK) -> Filled:
     """A store with one long run and a history of daily checks."""
     url = f"sqlite:///{folder / 'abbe.sqlite3'}"
     with Store.open(url) as store:
@@ -68,7 +71,7 @@ def fill(folder: Path, checks: int, readings: int = READINGS) -> Filled:
         path = {"feed_mm_min": feed_mm_min, "direction": 1, "points_mm": POINTS}
         start = {"setup": SETUP, "machine": MACHINE, "ctrl0_us": 5_000_000, "path": path, "rate_hz": 1000}
         run = store.runs.start(store.campaigns.add(machine, "long", {}), "r01", "ballbar_circle", "identify", start)
-        _samples(store, run, readings)
+        store.chunks.ingest(list(_chunks(run, readings, chunk)))
         store.runs.finish(run, "complete", "", {"path_start_us": 8_000_000, "path_end_us": 8_000_000 + readings * PERIOD_US})
         now = datetime.now(UTC)
         noise = np.random.default_rng(1).normal(0.0, 0.4, (checks, 2))
@@ -80,18 +83,18 @@ def fill(folder: Path, checks: int, readings: int = READINGS) -> Filled:
     return Filled(url, "mill-7", [DAILY], {}, "long", 0, [], 0)
 
 
-def _samples(store: Store, run: int, readings: int) -> None:
+def _chunks(run: int, readings: int, size: int) -> Iterator[ChunkRecord]:
     k = np.arange(-20, readings + 20)
     samples = np.zeros(k.size, SAMPLE)
     samples["seq"], samples["device_us"] = np.arange(k.size), 10**9 + np.arange(k.size) * PERIOD_US
     rng = np.random.default_rng(2)
     samples["reading_nm"] = 4000.0 * np.sin(k * 2e-5) + rng.normal(0.0, 300.0, k.size)
     samples["status"] = np.where((k >= 0) & (k < readings), ON_PATH, 0)
-    for number, at in enumerate(range(0, k.size, CHUNK)):
-        part = samples[at : at + CHUNK]
+    for number, at in enumerate(range(0, k.size, size)):
+        part = samples[at : at + size]
         payload = zlib.compress(part.tobytes(), 1)
         first, last = int(part["device_us"][0]), int(part["device_us"][-1])
-        store.chunks.append(run, "bar", number, part.size, BAR_CODEC, payload, 0.0, 0.0, first, last)
+        yield ChunkRecord(run, "bar", number, part.size, BAR_CODEC, zlib.crc32(payload), payload, 0.0, 0.0, first, last)
 
 
 def first_ms(page: Page, address: str) -> float:
@@ -143,10 +146,15 @@ def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--checks", type=int, default=365, help="daily checks in the trend")
+    parser.add_argument("--chunk", type=int, default=CHUNK, help="samples in a chunk of the run")
     parser.add_argument("--repeat", type=int, default=5)
     given = parser.parse_args()
     print(f"load {os.getloadavg()[0]:.1f} on {len(os.sched_getaffinity(0))} of {os.cpu_count()} cores")  # noqa: T201
-    with tempfile.TemporaryDirectory() as folder, served(fill(Path(folder), given.checks)) as one, launched() as chromium:
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        launched() as chromium,
+        served(fill(Path(folder), given.checks, chunk=given.chunk)) as one,
+    ):
         for name, path in (("a million readings", "/run?id=1"), (f"trend of {given.checks} checks", "/trends")):
             made = chromium.new_context(viewport={"width": 1280, "height": 800}, service_workers="block")
             made.add_cookies([{"name": COOKIE, "value": one.people.begin(one.people.get("vera")), "url": one.base}])
