@@ -22,7 +22,7 @@ from abbe.models.machine import Machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.sequences.check import step_seconds
-from abbe.service.sequences.control import Control, Watching
+from abbe.service.sequences.control import Control, State, Watching
 from abbe.service.sequences.recipes import recipe as recipes
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, RecordPath, TestPlan
@@ -192,12 +192,22 @@ class Keeps:
 
 
 class AtStep(Control):
-    """Does something when a step is reached, or a moment of wall time later."""
+    """Does something when a step is reached, or a moment of wall time later; ``clear``: what is done once that has suspended the run.
+
+    Not after some time: on a busy computer a door that is open for 0.2 s may be seen by nobody.
+    """
+
+    clear: Callable[[], None] = staticmethod(lambda: None)
 
     def __init__(self, step: int, do: Callable[[], None], delay_s: float = 0.0) -> None:
         super().__init__()
         self._step, self._do, self._delay_s = step, do, delay_s
         self.done = False
+
+    def now(self, state: State, why: str = "") -> None:
+        super().now(state, why)
+        if state == State.SUSPENDED:
+            self.clear()
 
     def place(self, step: int, steps: int, points: int) -> None:
         super().place(step, steps, points)

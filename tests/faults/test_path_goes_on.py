@@ -240,11 +240,8 @@ async def test_a_door_that_somebody_vouches_for_suspends_and_the_path_goes_on(pl
     plan = helix()
     site = replace(b.site, watching=Watching(None, Suspending(frozenset({"door"}), longest_s=20.0, settle_s=0.05), unknown_s=5.0))
     door = b.sim.world.controller.set_door
-
-    def opened() -> None:
-        door(is_open=True)
-        asyncio.get_running_loop().call_later(0.2, lambda: door(is_open=False))
-
-    await measure(b.session, store, site, plan, options=MeasureOptions(After(plan, b, 6.0, opened), yes))
+    control = After(plan, b, 6.0, lambda: door(is_open=True))
+    control.clear = lambda: door(is_open=False)
+    await measure(b.session, store, site, plan, options=MeasureOptions(control, yes))
     assert [r.status for r in runs(store)] == ["failed", "complete"]
     assert len(runs(store)[-1].start_doc["path"]["pieces"]) == 1

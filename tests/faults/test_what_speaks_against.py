@@ -268,9 +268,8 @@ async def test_what_was_done_stays_done_in_the_progress_after_a_suspension(place
     b, store = place
     plan = CampaignPlan("c", (small("Linear", positions=9),))
     door, seen = b.sim.world.controller.set_door, list[Progress]()
-    loop = asyncio.get_running_loop()
-    step = step_of(plan, MoveTo, 14)
-    control = AtStep(step, lambda: (door(is_open=True), loop.call_later(0.3, lambda: door(is_open=False))))
+    control = AtStep(step_of(plan, MoveTo, 14), lambda: door(is_open=True))
+    control.clear = lambda: door(is_open=False)
     site = replace(b.site, watching=Watching(None, SUSPENDING, unknown_s=5.0))
     await measure(b.session, store, site, plan, progress=seen.append, options=MeasureOptions(control))
     assert statuses(store)[-1] == ("test-2", "complete")
@@ -283,19 +282,18 @@ async def test_a_test_that_is_suspended_again_and_again_ends(place, monkeypatch)
     b, store = place
     monkeypatch.setattr(campaign_run, "MOST_TRIES", 2)
     plan, door = CampaignPlan("c", (small("Helix"),)), b.sim.world.controller.set_door
-    loop = asyncio.get_running_loop()
 
-    class Always(Control):
+    class Always(AtStep):
         def place(self, step: int, steps: int, points: int) -> None:
+            self._step, self.done = steps - 1, False  # the path, in what is left of the test, too
             super().place(step, steps, points)
-            if steps - step == 1:  # the path
-                door(is_open=True)
-                loop.call_later(0.2, lambda: door(is_open=False))
 
+    control = Always(0, lambda: door(is_open=True))
+    control.clear = lambda: door(is_open=False)
     site = replace(b.site, watching=Watching(None, Suspending(frozenset({"door"}), 10.0, 0.05), unknown_s=5.0))
     with pytest.raises(DoorOpen, match="3 times in a row without a new point"):
         async with asyncio.timeout(within(30)):
-            await measure(b.session, store, site, plan, options=MeasureOptions(Always()))
+            await measure(b.session, store, site, plan, options=MeasureOptions(control))
     assert len(store.runs.all()) == 3
 
 
