@@ -25,7 +25,7 @@ from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.login.login import signature_refusal
 from abbe.service.web.pages import file_fields
 from abbe.service.web.pages.context import PageContext
-from abbe.service.web.pages.file_fields import Field, edits_of, schedule_fields, shown_fields, with_names
+from abbe.service.web.pages.file_fields import Field, FormError, edits_of, schedule_fields, shown_fields, with_names
 from abbe.service.web.problems import problem
 
 LONGEST_FORM, MOST_FIELDS, LONGEST_REASON = 16_384, 60, 500
@@ -92,7 +92,10 @@ class _Desk:
             return problem(422, "the form needs the password and the fingerprint of the machine file")
         if self._stated is None or self._core is None:
             return problem(409, phrase(current().lang, "this service was started without a machine file"))
-        edits = made(form, self._stated)
+        try:
+            edits = made(form, self._stated)
+        except FormError as refusal:
+            return problem(409, current().translate(refusal.key))
         if not edits and made is not _nothing:
             return problem(409, current().translate("admin.same"))
         refused = await signature_refusal(self._context.auth, request, form["password"], current().translate("own.wrong"))

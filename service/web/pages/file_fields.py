@@ -16,12 +16,13 @@ from abbe.service.web.frame import current
 
 Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many", "times"]
 """``optional``: a text, ``maybe``: a number, that may be absent; ``range``: two numbers; ``yes``: yes or no; ``many``: boxes to tick;
-``times``: days and a time of day, or a cron expression."""
+``times``: days and a time of day, or a cron expression, or neither."""
 _NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
 _KEY = re.compile(r"\b(issuer|item|verify|limits|calibration|schedule)(?:\[([^\]]*)\])?(\.[a-z_.]*[a-z_])")
 ENDS = ("low", "high")
 DAYS = {"daily": "*", "workdays": "1-5", "mon": "1", "tue": "2", "wed": "3", "thu": "4", "fri": "5", "sat": "6", "sun": "0"}
 """Days of a schedule as they are chosen, and as a cron expression has them."""
+_TIME = re.compile(r"([01]\d|2[0-3]):[0-5]\d")
 _ONE_TIME = re.compile(r"(\d|[1-5]\d) (\d|1\d|2[0-3]) \* \* (\*|1-5|[0-6])")
 
 
@@ -77,7 +78,7 @@ LABORATORY, LIMITS = (*ISSUER, *ITEM), (*VERIFY, *PUSH, *MEASURE)
 SCHEDULE = (
     Field("name", "text", required=True),
     Field("recipe", "choice"),
-    Field("cron", "times", ("expression", *DAYS)),
+    Field("cron", "times", (*DAYS, "expression", "interval")),
     Field("every_h", "maybe"),
     Field("first", "optional"),
     Field("timezone", "text", required=True),
@@ -134,7 +135,9 @@ def shown_fields(fields: Sequence[Field], stated: MachineFileSummary) -> list[Sh
         one = known.get(field.key)
         blank = one is None or (one.origin == "default" and field.kind in {"optional", "maybe", "times"})
         value = None if one is None or blank else json.loads(one.value)
-        if value is None and (one is None or field.kind != "times"):
+        if value is None and field.kind == "times":
+            value = None if one is None else ""
+        elif value is None:
             value = SCHEDULE_DEFAULTS.get(field.key.partition("].")[2])
         found.append(ShownField(field, _texts(field, value), one is not None and one.origin == "environment"))
     return found
@@ -144,26 +147,45 @@ def _texts(field: Field, value: Any) -> tuple[str, ...]:
     if value is None and field.kind == "range":
         return ("", "")
     if field.kind == "times":
-        return _times(value or "")
+        return _times(value)
     if isinstance(value, list):
         return tuple(_text(one) for one in value)
     return ("" if value is None else _text(value),)
 
 
-def _times(cron: str) -> tuple[str, str, str]:
-    """A cron expression in a form: as chosen days and a time of day, or as it is."""
+class FormError(ValueError):
+    """Fields of a form contradict each other. ``key``: what to do, in the catalogues."""
+
+    def __init__(self, key: str) -> None:
+        super().__init__(key)
+        self.key = key
+
+
+def _times(cron: str | None) -> tuple[str, str, str]:
+    """Days, time of day and expression as a form shows a cron expression; empty: by interval; None: a new schedule, nothing is chosen."""
+    if not cron:
+        return "" if cron is None else "interval", "", ""
     found = _ONE_TIME.fullmatch(cron)
     if found is None:
-        return "expression", "06:00", cron
+        return "expression", "", cron
     days = next(name for name, known in DAYS.items() if known == found[3])
     return days, f"{int(found[2]):02}:{int(found[1]):02}", ""
 
 
-def _cron(days: str, time: str, expression: str) -> str | None:
-    if days not in DAYS:
+def _cron(key: str, expression: str, form: Mapping[str, str]) -> str | None:
+    """The cron expression that a form asks for. Raises FormError if it is not the only rule in the form."""
+    days, time = form.get(f"{key}.days"), form.get(f"{key}.time", "").strip()
+    interval = form.get(f"{key.removesuffix('cron')}every_h", "").strip()
+    if days is None:
         return expression or None
-    hour, _, minute = time.partition(":")
-    return f"{minute.removeprefix('0') or 0} {hour.removeprefix('0') or 0} * * {DAYS[days]}"
+    told = {"days": bool(time), "expression": bool(expression), "interval": bool(interval)}
+    way = "days" if days in DAYS else days
+    if [name for name, given in told.items() if given] != [way] or (way == "days" and not _TIME.fullmatch(time)):
+        raise FormError("admin.times")
+    if way != "days":
+        return expression or None
+    hour, minute = map(int, time.split(":"))
+    return f"{minute} {hour} * * {DAYS[days]}"
 
 
 def _text(value: Any) -> str:
@@ -173,7 +195,10 @@ def _text(value: Any) -> str:
 
 
 def edits_of(fields: Sequence[Field], form: Mapping[str, str], stated: MachineFileSummary) -> tuple[FileEdit, ...]:
-    """The changes that a sent form asks for: values that differ from those in force. Fields that the form lacks change nothing."""
+    """The changes that a sent form asks for: values that differ from those in force. Fields that the form lacks change nothing.
+
+    Raises FormError if fields contradict each other.
+    """
     known = {one.key: one for one in stated.values}
     found = []
     for field in fields:
@@ -214,7 +239,7 @@ def _sent(field: Field, form: Mapping[str, str]) -> Any:
         case "many":
             return [one for one in field.options if form.get(f"{field.key}.{one}") == "yes"]
         case "times":
-            return _cron(form.get(f"{field.key}.days", ""), form.get(f"{field.key}.time", ""), text)
+            return _cron(field.key, text, form)
         case "date" | "optional":
             return text or None
     return text

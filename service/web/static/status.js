@@ -82,9 +82,20 @@ document.addEventListener("click", (event) => {
   if (point) location.assign(point.dataset.href);
 });
 
+let asking = new AbortController();
+let quietUntil = 0;
+
 function ask(path, active) {
-  return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: AbortSignal.timeout(PATIENCE_MS) });
+  const one = asking = new AbortController();
+  setTimeout(() => one.abort(), PATIENCE_MS);
+  return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: one.signal });
 }
+
+// Whoever logs out asks nothing more: the answer would be a refusal.
+document.getElementById("logout")?.form.addEventListener("submit", () => {
+  quietUntil = performance.now() + PATIENCE_MS;
+  asking.abort();
+});
 
 async function replaceContent(next) {
   const answer = await ask("/", false);
@@ -121,6 +132,7 @@ function loggedOut() {
 }
 
 async function refresh() {
+  if (performance.now() < quietUntil) { setTimeout(refresh, PERIOD_MS); return; }
   let silent = false;
   try {
     const active = touched;
@@ -149,7 +161,7 @@ async function refresh() {
     connected(true);
   } catch {
     // Whatever the reason, the page is stale from now on.
-    connected(false, silent);
+    if (performance.now() >= quietUntil) connected(false, silent);
   }
   setTimeout(refresh, PERIOD_MS);
 }

@@ -17,7 +17,7 @@ from abbe.service.web.language import catalogue
 from abbe.service.web.login.access import route_permissions
 from abbe.service.web.pages import administration
 from abbe.service.web.pages import file_fields as fields
-from abbe.service.web.pages.file_fields import edits_of, schedule_fields, shown_fields
+from abbe.service.web.pages.file_fields import FormError, edits_of, schedule_fields, shown_fields
 from tests.pages_world import USERS, Served, as_user
 from tests.service.test_machine_changes import PATH, TEXT
 from tests.service.web.test_table_orders import Desk, desk
@@ -111,20 +111,41 @@ def test_untouched_forms_ask_for_nothing() -> None:
         ),
         (
             schedule_fields(1, ()),
-            {"schedule[1]__every_h": "24", "schedule[1]__cron__days": "expression"},
+            {"schedule[1]__every_h": "24", "schedule[1]__cron__days": "interval", "schedule[1]__cron__time": ""},
             {"schedule[1].cron": "null", "schedule[1].every_h": "24"},
         ),
         (schedule_fields(1, ()), {"schedule[1]__cron__days": "workdays"}, {"schedule[1].cron": '"0 6 * * 1-5"'}),
         (schedule_fields(1, ()), {"schedule[1]__cron__time": "00:05"}, {"schedule[1].cron": '"5 0 * * 1"'}),
         (
             schedule_fields(1, ()),
-            {"schedule[1]__cron__days": "expression", "schedule[1]__cron": "0 6 1 * *"},
+            {"schedule[1]__cron__days": "expression", "schedule[1]__cron__time": "", "schedule[1]__cron": "0 6 1 * *"},
             {"schedule[1].cron": '"0 6 1 * *"'},
         ),
     ],
 )
 def test_a_form_asks_for_what_differs(some: Any, changes: dict[str, str], expected: dict[str, str]) -> None:
     assert asked(some, **changes) == expected
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"cron": "0 2 1 * *"},
+        {"every_h": "24"},
+        {"cron.time": ""},
+        {"cron.time": "6"},
+        {"cron.days": ""},
+        {"cron.days": "expression"},
+        {"cron.days": "expression", "cron": "0 2 1 * *"},
+        {"cron.days": "expression", "cron.time": ""},
+        {"cron.days": "interval", "cron.time": ""},
+        {"cron.days": "interval", "every_h": "24"},
+        {"cron.days": "often"},
+    ],
+)
+def test_times_that_a_form_states_twice_or_not_at_all_are_refused(changes: dict[str, str]) -> None:
+    with pytest.raises(FormError, match=r"admin\.times"):
+        asked(schedule_fields(1, ()), **{f"schedule[1].{key}": value for key, value in changes.items()})
 
 
 @pytest.mark.parametrize("times", ['cron = "00 06 * * 1"', 'cron = "0 6 1 * *"', "every_h = 8.0", 'cron = "59 23 * * 0"'])
@@ -135,7 +156,7 @@ def test_an_untouched_schedule_keeps_its_times(times: str) -> None:
 
 def test_a_new_schedule_and_a_first_laboratory_are_valid_files() -> None:
     known, plan = stated(TEXT), schedule_fields(1, ("quick-check",))
-    form = sent(plan, known) | {"schedule[1].name": "night", "schedule[1].cron.time": "02:00"}
+    form = sent(plan, known) | {"schedule[1].name": "night", "schedule[1].cron.days": "daily", "schedule[1].cron.time": "02:00"}
     loaded = parse_machine(PATH, TEXT.encode())
     entry = changed(loaded, edits_of(plan, form, known)).machine.schedule[0]
     assert entry == Schedule("night", "0 2 * * *")
