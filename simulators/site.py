@@ -53,6 +53,8 @@ REST_S = 0.2
 """Time between two ticks while nothing streams or is buffered. This suffices because every request brings the world up to date."""
 AHEAD_S, AHEAD_SAMPLES = 10.0, 2000
 """Simulated time, and samples, by which a world that is faster than real time runs ahead of a host that watches it."""
+WAITS_S = 0.5
+"""Wall time for which it waits: who does not ask for longer does not watch, and after a second without a sample the box is silent."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 
 
@@ -60,13 +62,14 @@ class Site:
     """All connections of one simulated world. Simulated time = speed x wall time since ``start``.
 
     A world that is faster than real time waits for its host: while samples stream and a connected host has asked the controller, it runs
-    on for `AHEAD_S` at most until the next question. At 60 times, a host that gets no core for 0.4 s would be 24 s late.
+    on for `AHEAD_S` at most until the next question, or for `WAITS_S` of wall time. At 60 times, a host that gets no core for 0.4 s would
+    be 24 s late.
     """
 
     def __init__(self, scenario: Scenario, link_dir: Path | None = None) -> None:
         self.world = World(scenario)
         self._scenario = scenario
-        self._last_s = self._at_s = 0.0
+        self._last_s = self._at_s = self._heard_s = 0.0
         self._asked_s: float | None = None
         self._ticking: asyncio.Handle | None = None
         self._resting = False
@@ -126,7 +129,7 @@ class Site:
     def _asked(self) -> None:
         """The host asks the controller."""
         self.advance()
-        self._asked_s = self._at_s
+        self._asked_s, self._heard_s = self._at_s, self._last_s
 
     def _advance(self) -> None:
         now_s, rate_hz = asyncio.get_running_loop().time(), self.world.ballbar.rate_hz
@@ -135,6 +138,8 @@ class Site:
             self._asked_s = None
         elif self._asked_s is not None and self._scenario.speed > 1.0:
             due_s = min(due_s, max(self._at_s, self._asked_s + min(AHEAD_S, AHEAD_SAMPLES / rate_hz)))
+            if now_s - self._heard_s > WAITS_S:
+                self._asked_s = None
         self._last_s, self._at_s = now_s, due_s
         self.world.advance(due_s)
 

@@ -1,5 +1,6 @@
 """The simulator as a process, over its real wires, with raw bytes from the protocol documents."""
 
+import asyncio
 import json
 import os
 import select
@@ -12,10 +13,13 @@ import time
 from contextlib import closing
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from abbe.simulators.scenario import Scenario
+from abbe.simulators.site import Site
 from tests.patience import within
 
 IDENTIFY = bytes.fromhex("A55A810201001D72")
@@ -171,31 +175,29 @@ def test_a_reader_who_sleeps_finds_a_gap_marked_by_bit_2(start) -> None:
         assert not any(s[3] & 4 for s in samples[:marked])
 
 
-def controller_us(link: socket.socket) -> int:
-    link.sendall(bytes.fromhex("000700000006010300100004"))
-    return int(struct.unpack(">9xQ", link.recv(300))[0])
+def test_a_world_faster_than_real_time_waits_for_a_host_that_watches_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    wall_s = [0.0]
+    monkeypatch.setattr(asyncio, "get_running_loop", lambda: SimpleNamespace(time=lambda: wall_s[0]))
+    site, line = Site(Scenario(speed=50.0)), SimpleNamespace(connected=True)
+    site._cnc = line
 
+    def passed_s(seconds: float) -> float:
+        """Simulated time between two questions of the host."""
+        site.registers.read(16, 4)
+        before_s, end_s = site.world.time_s, wall_s[0] + seconds
+        while wall_s[0] < end_s:
+            wall_s[0] += 0.005
+            site._advance()
+        return site.world.time_s - before_s
 
-def test_a_world_faster_than_real_time_waits_for_a_host_that_watches_it(start) -> None:
-    with start("--speed", "50") as sim, closing(Line(sim.path("ballbar"))) as line:
-        os.write(line.fd, START_1000)
-        line.read_until(lambda d: len(d) > 500)
-
-        def passed_us() -> int:
-            with socket.create_connection(("127.0.0.1", sim.port("cnc")), 5) as link:
-                before = controller_us(link)
-                select.select([], [], [], 0.3)  # the host gets no core
-                return controller_us(link) - before
-
-        assert 0 < passed_us() <= 2_000_001, "2000 samples"
-        with socket.create_connection(("127.0.0.1", sim.port("cnc")), 5) as link:
-            gone_us = controller_us(link)
-        select.select([], [], [], 0.3)
-        with socket.create_connection(("127.0.0.1", sim.port("cnc")), 5) as link:
-            assert controller_us(link) - gone_us >= 14_000_000, "for a host that has hung up nobody waits"
-        os.write(line.fd, STOP)
-        line.read_until(lambda d: frames(d)[-1][0] == 3)
-        assert passed_us() >= 15_000_000, "nothing streams, so nobody is late"
+    assert passed_s(0.3) == pytest.approx(15.0, abs=0.3), "nothing streams, so nobody is late"
+    assert site.world.ballbar.start(1000, site.world.time_s)
+    assert passed_s(0.02) == pytest.approx(1.0, abs=0.3), "it asks often enough"
+    assert passed_s(0.45) == pytest.approx(2.0), "2000 samples"
+    assert 2.0 < passed_s(1.0) < 30.0, "who asks nothing for so long does not watch"
+    site.registers.read(16, 4)
+    line.connected = False
+    assert passed_s(0.3) == pytest.approx(15.0, abs=0.3), "nobody waits for a host that has hung up"
 
 
 def test_ballbar_over_tcp(start) -> None:
