@@ -41,6 +41,7 @@ FONTS = (
 )  # fmt: skip
 """Folders into which Debian's `fonts-noto-cjk`, people and `deploy/npm_files.py` put such fonts; `ABBE_FONTS` names another folder."""
 NO_FONT = "Letters of this report have no font on this computer: install fonts-noto-cjk, or name a folder in ABBE_FONTS."
+NOT_KEPT = "This PDF is neither PDF/A (for archives) nor PDF/UA (accessible): {cause}"
 IN_ENGLISH = (
     "This report is in English: its language ({lang}) has no font on this computer. Install fonts-noto-cjk, or run deploy/npm_files.py."
 )
@@ -62,8 +63,8 @@ def document_html(document: Document) -> str:
 def document_pdf(document: Document) -> bytes:
     """The report as PDF (A4), set by typst with its bundled fonts, without clock or network. Equal reports give equal bytes.
 
-    It conforms to PDF/UA-1 (ISO 14289-1) and, if a day is on record, to PDF/A-2a (ISO 19005-2); typst checks both. With a letter that no
-    font prints it is neither.
+    It conforms to PDF/UA-1 (ISO 14289-1) and, if a day of measurement is on record, to PDF/A-2a (ISO 19005-2); typst checks both. Where
+    that cannot be, as with a letter that no font prints, a remark says why.
     Chinese, Japanese and Korean letters need a font of the computer. Without such a font the report is in English and says
     so; it also says which names it cannot print.
     """
@@ -72,7 +73,7 @@ def document_pdf(document: Document) -> bytes:
     known, remark = {lang: font_folders(lang) for lang in FONTS_OF}, ""
     if document.lang in known and not known[document.lang]:
         remark, document = IN_ENGLISH.format(lang=document.lang), replace(document, lang=ENGLISH)
-    data: dict[str, Any] = shown(document, standalone) | {"font": FONT, "day": document.issued or (document.days or ("",))[-1]}
+    data: dict[str, Any] = shown(document, standalone) | {"font": FONT, "day": _day(document)}
     folders = [*dict.fromkeys(folder for found in known.values() for folder in found)]
     text = json.dumps(data, ensure_ascii=False)
     if _EAST.search(text):
@@ -88,10 +89,16 @@ def document_pdf(document: Document) -> bytes:
     set_by = partial(typst.compile, template, format="pdf", font_paths=fonts, sys_inputs=inputs)
     try:
         made = set_by(pdf_standards=["a-2a", "ua-1"] if data["day"] else ["ua-1"])
-    except typst.TypstError:
-        made = set_by()
+    except typst.TypstError as err:
+        data["remarks"] = [*data["remarks"], phrase(document.lang, NOT_KEPT).format(cause=str(err).partition("\n")[0])]
+        made = set_by(sys_inputs={"data": json.dumps(data, ensure_ascii=False)})
     assert isinstance(made, bytes)  # one document, not one file for each page
     return made
+
+
+def _day(document: Document) -> str:
+    """Last day of the measurement, else the day of a certificate's issue: never the day on which a report is printed again."""
+    return document.days[-1] if document.days else document.issued if document.issuer else ""
 
 
 def _printable(text: str, known: Mapping[str, list[str]]) -> bool:

@@ -83,11 +83,23 @@ def test_a_dated_report_is_an_archivable_accessible_pdf_that_others_find_whole(t
     assert all("/ToUnicode" in f for f in fonts)
 
 
-def test_a_report_without_a_day_is_accessible_and_one_with_a_letter_of_no_font_claims_nothing(monkeypatch):
+def test_a_report_without_a_day_is_accessible():
     assert declared(pypdf.PdfReader(io.BytesIO(document_pdf(document())))) == {"pdfuaid:part": "1"}
+
+
+@pytest.mark.parametrize("letter", ["基準", "👍", "\ue000"])
+def test_a_letter_of_no_font_is_no_standard_and_the_report_says_so(monkeypatch, letter):
     monkeypatch.setattr(document_page, "FONTS", ())
     monkeypatch.delenv("ABBE_FONTS", raising=False)
-    assert declared(pypdf.PdfReader(io.BytesIO(document_pdf(document(title="基準"))))) == {}
+    made = document_pdf(document(remarks=[letter], days=("2026-11-27", "2026-11-28")))
+    assert declared(pypdf.PdfReader(io.BytesIO(made))) == {}
+    assert "ThisPDFisneitherPDF/A(forarchives)norPDF/UA(accessible):PDF/A-2a" in pdf_text(made)
+
+
+def test_a_report_that_is_printed_on_another_day_is_the_same():
+    days = ("2026-11-27", "2026-11-28")
+    assert len({document_pdf(document(days=days, issued=day)) for day in ("2026-11-28", "2027-03-01")}) == 1
+    assert len({document_pdf(document(issued=day)) for day in ("2026-11-28", "2027-03-01")}) == 1
 
 
 def declared(reader: pypdf.PdfReader) -> dict[str, str]:
