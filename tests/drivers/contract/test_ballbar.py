@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import socket
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
@@ -15,9 +15,17 @@ from abbe.drivers.errors import BadFrame, LinkDown, LossyLine, Rebooted, Refused
 from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import SocketUrl, parse_url
 from abbe.drivers.registry import open_ballbar
+from tests.faults.patient import patience
 from tests.patience import within
 
 STOP, START, IDENTIFY = 0x83, 0x82, 0x81
+
+
+@pytest.fixture(scope="module", autouse=True)
+def patient() -> Iterator[None]:
+    """Box and driver live in one process: while it gets no core, no time passes for either."""
+    with patience():
+        yield
 
 
 @pytest.fixture
