@@ -359,12 +359,16 @@ class Stream:
             self._batches.clear()
 
     async def get(self, timeout_s: float) -> BarBatch:
-        """Wait for the next batch; raises TimeoutError if none comes."""
-        async with asyncio.timeout(timeout_s):
-            while not self._batches and self._error is None:
-                self._news.clear()
-                if not self._batches and self._error is None:
-                    await self._news.wait()
+        """Wait for the next batch; raises TimeoutError if none comes. What came while this computer stalled has come."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                while not self._batches and self._error is None:
+                    self._news.clear()
+                    if not self._batches and self._error is None:
+                        await self._news.wait()
+        except TimeoutError:
+            if not self._batches and self._error is None:
+                raise
         with self._lock:
             if self._batches:
                 batch = self._batches.popleft()

@@ -98,3 +98,14 @@ async def test_a_stream_is_finished_only_when_nobody_puts_into_it_and_takes_noth
     stream.put(0.0, samples[50:], overran=False)
     assert tap.most == 1
     assert tap.seqs == list(range(50))
+
+
+async def test_samples_that_came_while_this_computer_stalled_are_no_silence() -> None:
+    stream = Stream("bar", 1000, 30.0, None, 1)
+    getting = asyncio.create_task(stream.get(0.05))
+    await asyncio.sleep(0)
+    stream.put(0.0, [BarSample(seq, 1000 * (seq + 1), 1000 * seq, 8) for seq in range(50)], overran=False)
+    threading.Event().wait(0.2)  # the loop gets no core, and its deadline passes
+    assert (await getting).samples[0].seq == 0
+    with pytest.raises(TimeoutError):
+        await stream.get(0.05)
