@@ -13,8 +13,8 @@ ALARM_NONE, ALARM_ESTOP = 0, 1
 _ARRIVED_MM = 1e-6
 _BEYOND_MM = 1e-9
 _SHORT_US = 200_000
-"""How long the control has to do nothing before a motion is over that did not reach its target: the control accepts a line, and looks idle
-until its servo thread has run. On a busy computer without real time that takes longer than a look."""
+"""How long the control has to do nothing before a motion is over that was not seen to reach its target: the control accepts a line, and
+looks idle until its servo thread has run. On a busy computer without real time that takes longer than a look."""
 # Absolute, mm, mm/min, no tool offsets or cutter radius; corners blended within 1 um, and no point left out (Q0).
 _MODES = "G21 G90 G94 G17 G40 G49 G80"
 _HEADER = (_MODES, "G64 P0.001 Q0")
@@ -79,6 +79,7 @@ class Motion:
         self._pending: _Pending | None = None
         self._path_points = 0
         self._idle_us: int | None = None
+        self._left = False
         control.hold(on=False)
         control.path_output(on=False)
 
@@ -146,22 +147,24 @@ class Motion:
             return
         self._path_points = self.points_done if self._pending.is_path else self._path_points
         arrived = max(abs(a - b) for a, b in zip(self.state.position_mm, self._pending.target_mm, strict=True)) < _ARRIVED_MM
-        if arrived and self.state.in_position and self.state.queue == 0 and not self.in_position_us:
+        self._left = self._left or not arrived
+        if arrived and self._left and self.state.in_position and self.state.queue == 0 and not self.in_position_us:
             self.in_position_us = self._now_us()
         if not self.state.ready:
             self._idle_us = None
         else:
-            self._path_points = self._pending.points if arrived and self._pending.is_path else self._path_points
             begun = self._pending.touch_from_mm
             if begun is not None and self.state.tripped and not self._pending.aborted and begun != self.state.position_mm:  # no old trip
                 self.latch = self.state.probed_mm, self._now_us()
-            self._idle(counts=arrived or self._pending.aborted or self.latch is not None)
+            self._idle(arrived=arrived, stopped=self._pending.aborted or self.latch is not None)
 
-    def _idle(self, *, counts: bool) -> None:
-        """The control does nothing: the motion is over, or has not begun."""
+    def _idle(self, *, arrived: bool, stopped: bool) -> None:
+        """The control does nothing: the motion is over, or has not begun. A closed path begins where it ends."""
         self._idle_us = self._now_us() if self._idle_us is None else self._idle_us
-        if counts or self._now_us() - self._idle_us >= _SHORT_US:
-            self._end(counts=counts)
+        if stopped or (arrived and self._left) or self._now_us() - self._idle_us >= _SHORT_US:
+            if arrived and self._pending is not None and self._pending.is_path:
+                self._path_points = self._pending.points
+            self._end(counts=arrived or stopped)
 
     def _end(self, *, counts: bool) -> None:
         self.in_position_us = self.in_position_us or self._now_us()
@@ -252,7 +255,7 @@ class Motion:
 
     def _begin(self, pending: _Pending) -> None:
         self._control.complaints()
-        self.in_position_us, self.latch, self._idle_us = 0, None, None
+        self.in_position_us, self.latch, self._idle_us, self._left = 0, None, None, False
         self._pending = pending
 
     def _refusal(self, feed_mm_min: float) -> Result:

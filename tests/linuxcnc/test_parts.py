@@ -203,7 +203,7 @@ def test_modbus_requests_are_answered_or_refused(bridge, request_, reply):
 class Idle:
     """A control that stands still and does nothing: what a line that it has just accepted looks like until its servo thread runs."""
 
-    low_mm, high_mm = (0.0,) * 3, (600.0,) * 3
+    low_mm, high_mm, fastest_mm_s = (0.0,) * 3, (600.0,) * 3, 100.0
 
     def __init__(self) -> None:
         quiet = ("estop", "interpreting", "spindle", "door_open", "probe_ready", "deflected", "tripped")
@@ -219,7 +219,7 @@ class Idle:
     def nothing(self, *_: object, **__: object) -> None:
         return None
 
-    hold = path_output = complaints = mdi = abort = nothing
+    hold = path_output = complaints = mdi = run = abort = nothing
 
 
 @pytest.fixture
@@ -241,6 +241,31 @@ def test_a_motion_is_not_over_before_the_servo_thread_has_begun_it(moved):
     motion.tick()
     control.shows(ready=True, in_position=True, queue=0, position_mm=(10.0, 0.0, 0.0))
     motion.tick()
+    assert (motion.moving, motion.done) == (False, 1)
+
+
+def test_a_closed_path_is_not_over_before_it_has_begun(bridge, tmp_path):
+    control, clock = Idle(), [1]
+    motion = bridge.motion.Motion(control, lambda: clock[0], tmp_path / "path.ngc")
+    motion.fifo = [(10.0, 0.0, 0.0), (10.0, 10.0, 0.0), (0.0, 0.0, 0.0)]
+    assert motion.path_start(1000.0) == bridge.motion.Result.OK
+    motion.tick()
+    assert (motion.path_running, motion.points_done, motion.in_position_us) == (True, 0, 0)
+    control.shows(ready=False, in_position=False, queue=2, position_mm=(5.0, 0.0, 0.0))
+    motion.tick()
+    clock[0] += 1_000_000
+    control.shows(ready=True, in_position=True, queue=0, position_mm=(0.0, 0.0, 0.0))
+    motion.tick()
+    assert (motion.path_running, motion.points_done, motion.path_end_us, motion.done) == (False, 3, clock[0], 1)
+
+
+def test_a_motion_too_short_to_be_seen_counts(bridge, tmp_path):
+    control, clock = Idle(), [1]
+    motion = bridge.motion.Motion(control, lambda: clock[0], tmp_path / "path.ngc")
+    assert motion.move((0.0, 0.0, 0.0), 1000.0) == bridge.motion.Result.OK
+    for _ in range(3):
+        clock[0] += 150_000
+        motion.tick()
     assert (motion.moving, motion.done) == (False, 1)
 
 
