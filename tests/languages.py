@@ -32,7 +32,7 @@ REMARKS = (
 )
 """What people of the world wrote."""
 SHORT = words(
-    "Abbe PIN RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad English Deutsch µrad µin"
+    "Abbe PIN RMS PDF CSV PNG JSON cron CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad English Deutsch µrad µin"
 )
 CODES = (
     r"CAL-[-0-9a-f]+",
