@@ -31,8 +31,8 @@ REMARKS = (
     "03:39:51 verified",
 )
 """What people of the world wrote."""
-SHORT = words(
-    "Abbe PIN RMS PDF CSV PNG JSON cron CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad English Deutsch µrad µin"
+SHORT = words("cron English Deutsch") | words(
+    "Abbe PIN RMS PDF CSV PNG JSON CUSUM EWMA MQTT GUM ISO IEC CRC SHA POST CNC LSC CAL rms max min ppm hPa mrad µrad µin"
 )
 CODES = (
     r"CAL-[-0-9a-f]+",
