@@ -21,12 +21,14 @@ class ControlGone(Exception):  # noqa: N818 - reads as what it is
 
 @dataclass(frozen=True)
 class Snapshot:
-    """State of the control at one instant. ``ready``: the control executes nothing and no axis moves. Positions are commanded ones, mm."""
+    """State of the control at one instant. ``ready``: the control executes nothing and no axis moves; ``refused``:
+    its last command ended with an error. Positions are commanded ones, mm."""
 
     estop: bool
     drives_on: bool
     homed: bool
     ready: bool
+    refused: bool
     in_position: bool
     interpreting: bool
     spindle: bool
@@ -90,6 +92,7 @@ class Control:
             drives_on=s.task_state == linuxcnc.STATE_ON,
             homed=all(s.homed[:JOINTS]),
             ready=bool(idle and still and s.inpos and s.queue == 0),
+            refused=s.state == linuxcnc.RCS_ERROR,
             in_position=bool(s.inpos and still),
             interpreting=s.interp_state != linuxcnc.INTERP_IDLE,
             spindle=bool(s.spindle[0]["enabled"]),

@@ -206,7 +206,7 @@ class Idle:
     low_mm, high_mm, fastest_mm_s = (0.0,) * 3, (600.0,) * 3, 100.0
 
     def __init__(self) -> None:
-        quiet = ("estop", "interpreting", "spindle", "door_open", "probe_ready", "deflected", "tripped")
+        quiet = ("estop", "interpreting", "refused", "spindle", "door_open", "probe_ready", "deflected", "tripped")
         ready = ("drives_on", "homed", "ready", "in_position", "remote")
         self.shown = SimpleNamespace(**dict.fromkeys(quiet, False), **dict.fromkeys(ready, True), position_mm=(0.0,) * 3, queue=0, line=0)
 
@@ -234,7 +234,7 @@ def moved(bridge, tmp_path):
 def test_a_motion_is_not_over_before_the_servo_thread_has_begun_it(moved):
     motion, control, clock = moved
     for _ in range(5):
-        clock[0] += 20_000
+        clock[0] += 300_000
         motion.tick()
         assert motion.moving
     control.shows(ready=False, in_position=False, queue=1)
@@ -270,7 +270,8 @@ def test_a_motion_too_short_to_be_seen_counts(bridge, tmp_path):
 
 
 def test_a_line_that_the_control_refuses_ends_and_counts_for_nothing(moved):
-    motion, _, clock = moved
+    motion, control, clock = moved
+    control.shows(refused=True)
     for _ in range(3):
         clock[0] += 150_000
         motion.tick()
