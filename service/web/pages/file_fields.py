@@ -91,14 +91,7 @@ SCHEDULE = (
     Field("needs.operator", "choice", ("any", "present", "absent")),
 )
 """Fields of one schedule; their keys follow ``schedule[N].``."""
-SCHEDULE_DEFAULTS = {
-    "cron": "0 6 * * *",
-    "timezone": "UTC",
-    "recipe": "quick-check",
-    "catch_up": "skip",
-    "on_alarm": "none",
-    "needs.operator": "any",
-}
+SCHEDULE_DEFAULTS = {"timezone": "UTC", "recipe": "quick-check", "catch_up": "skip", "on_alarm": "none", "needs.operator": "any"}
 
 
 def schedule_fields(number: int, recipes: Sequence[str]) -> tuple[Field, ...]:
