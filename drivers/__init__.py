@@ -1,1 +1,1 @@
-"""Drivers: async communication with instruments and controllers; they know bytes, but neither physics nor measuring jobs."""
+"""Asynchronous communication with instruments and controllers. Physics and measuring jobs are not part of a driver."""

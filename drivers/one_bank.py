@@ -92,7 +92,7 @@ class OneBankTables:
         self._owner = 0 if self._owner == owner else self._owner
 
     async def read_bank(self, bank: int, n_bytes: int | None = None, *, first: int = 0) -> bytes:
-        """Read the control's table (active bank) or the staged one. ``n_bytes`` None: the whole image, as its header states its length."""
+        """Read the control's table (active bank) or the staged one. ``n_bytes`` None: the whole image, of the length in its header."""
         whole = await self._c.read_table() if bank == self._active else bytes(self._staged or b"")
         return image_in(whole) if n_bytes is None else whole[2 * first : 2 * first + n_bytes]
 
@@ -102,7 +102,7 @@ class OneBankTables:
         Raises
         ------
         Refused
-            The bank is the one that acts.
+            The bank is active.
         """
         if bank == self._active:
             raise Refused("one table", "write bank", "the bank is active")

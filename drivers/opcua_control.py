@@ -254,7 +254,7 @@ def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
 
 
 async def _secured(client: Any, url: str, access: dict[str, str]) -> None:
-    """Encrypt a session and log in, as the URL wants it."""
+    """Encrypt a session and log in, as the URL requires."""
     from asyncua.crypto.security_policies import SecurityPolicyBasic256Sha256
 
     try:

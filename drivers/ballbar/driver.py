@@ -99,7 +99,7 @@ class Box:
             )
 
     def check_can(self, rate_hz: int, range_mm: float) -> None:
-        """Raise ``Refused`` if the box cannot have this rate or stroke, as far as it reports its limits."""
+        """Raise ``Refused`` if the rate or stroke exceeds a limit that the box reports."""
         if 0 < self._max_rate_hz < rate_hz:
             detail = f"{rate_hz} Hz requested, but the box sends at most {self._max_rate_hz} Hz"
             raise Refused(self._name, "check", detail, "choose a lower rate")

@@ -359,7 +359,7 @@ class Stream:
             self._batches.clear()
 
     async def get(self, timeout_s: float) -> BarBatch:
-        """Wait for the next batch; raises TimeoutError if none comes. What came while this computer stalled has come."""
+        """Wait for the next batch; raises TimeoutError if none came, even while this computer stalled."""
         try:
             async with asyncio.timeout(timeout_s):
                 while not self._batches and self._error is None:

@@ -193,7 +193,7 @@ async def _words(probe: DeviceUnderTest, name: str) -> tuple[int, ...]:
 
 
 def wrong_motion(got_mm: float, move: Move, where: str = "device file") -> str:
-    """Return the fault of a motion as it was read, and its correction in the ``where`` (device file or driver); empty without one."""
+    """Describe how a motion was misread, and what to correct in the ``where`` (device file or driver); empty if it was read right."""
     if abs(got_mm - move.mm) <= move.tolerance_mm:
         return ""
     read = f"{move.mm:g} mm is read as {got_mm:.4f} mm"

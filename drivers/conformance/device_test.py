@@ -47,7 +47,7 @@ from abbe.drivers.links.urls import (
 from abbe.drivers.registry import open_ballbar, open_controller, open_laser
 
 TRIES = 6
-"""Readings around each fault."""
+"""Number of readings requested around each fault."""
 RECOVERS_S = 15.0
 """Longest time until a reading is right again."""
 PAUSE_S = 0.2
@@ -76,7 +76,7 @@ async def faults(open_at: Callable[[], Awaitable[DeviceUnderTest]], proxy: Proxy
     open_at : callable
         Opens the device behind the proxy.
     close_mm : float
-        Least allowed distance of a right reading at rest from the mean, mm or degree C; noise widens it.
+        Smallest tolerance of a reading at rest about the mean, mm or degree C; noise widens the tolerance.
     """
     try:
         probe = await open_at()
@@ -152,7 +152,7 @@ OWN_TIMEOUT_S = 1.0
 AT_REST_MM = 0.002
 _METER, _CONTROL = ("motion displacement",), ("motion x", "motion y", "motion z")
 MOTIONS = {"displacement": _METER, "laser": _METER, "ballbar": ("motion radius",), "position": _CONTROL, "cnc": _CONTROL}
-"""Known motions that must have been made before readings of a kind count."""
+"""Checks of a known motion that must pass before a measurement may use readings of a kind."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -222,10 +222,10 @@ def _report(text: str, about: Described | None, role: str, info: DeviceInfo, fou
 
 
 def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
-    """Return the abilities of a device by the findings of its test.
+    """Return the abilities that the findings of a device's test prove: none after a failed check.
 
-    A displacement counts if its freshness and a known motion were proved, a position if the motion of all axes was proved, both only if no
-    check failed. The test of a device file never proves motion or tables: only a driver and `abbe comp commission` do.
+    `DWELL` needs proof of freshness and of a known motion (of every axis for a control). The test of a device file never proves motion or
+    tables: only a driver and `abbe comp commission` do.
     """
     if any(one.verdict is CheckVerdict.FAILED for one in found):
         return ()
@@ -240,9 +240,7 @@ def summary(report: TestReport) -> str:
     if report.failed:
         return "it cannot be used: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:
-        return (
-            "it can measure: its readings count while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
-        )
+        return "it can measure while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
     return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED)
 
 

@@ -1,6 +1,6 @@
 """A control that is only listened to: it shows positions and states, or nothing at all. It never moves and holds no tables.
 
-With it, `abbe listen` works at a machine whose control has no interface, only a digital read-out, or a PLC with three positions.
+`abbe listen` then works with a digital read-out, with a PLC that holds three positions, and with a control that has no interface at all.
 """
 
 from __future__ import annotations

@@ -23,7 +23,7 @@ LOSES_ZERO = {"beam lost", "no reflector", "fault"}
 """States after which an incremental instrument must be zeroed anew."""
 TENTH_NM_PER_MM = 1e7
 SOON_S = 10.0
-"""A 16-bit counter of up to 1000 readings a second and more does not pass half of its range in this time."""
+"""Seconds in which a 16-bit counter of 1000 readings per second passes less than half of its range."""
 NEW_S = 2.0
 """Longest wait for a new reading; a device that shows an old reading for longer is stuck."""
 ZEROED_MM = 0.05

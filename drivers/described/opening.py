@@ -1,4 +1,4 @@
-"""Opens described devices: the wire by the URL, the rest by the device file. For a job, only tested abilities count."""
+"""Opens described devices: the wire by the URL, the rest by the device file. A job may use only tested abilities."""
 
 from __future__ import annotations
 
@@ -68,7 +68,7 @@ async def open_meter(url: DeviceUrl, *, needed: Ability | None = None) -> Descri
     Raises
     ------
     BadDeviceFile, BadUrl
-        The device file cannot be used, describes another kind of device, or another wire.
+        The device file cannot be used, or describes another kind of device or another wire than the URL.
     NotProved
         As for `check_tested`.
     WrongDevice, LinkDown, ReplyTimeout, BadFrame, DeviceFault

@@ -58,7 +58,7 @@ def _holds(file: DeviceFile, flag: Flag, count: float) -> bool:
 
 
 class RequestPacer:
-    """Keeps requests at most ``rate_hz`` apart: a device may answer wrongly, or not at all, if it is asked faster."""
+    """Limits requests to ``rate_hz`` per second: a device that is asked faster may answer wrongly, or not at all."""
 
     def __init__(self, rate_hz: float) -> None:
         self._apart_s = 1.0 / rate_hz

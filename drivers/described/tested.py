@@ -16,7 +16,7 @@ FORMAT = "abbe-device-test/1"
 
 
 class Ability(StrEnum):
-    """Use of a device. `DWELL` needs more proofs than `WATCH`.
+    """Permitted use of a device. `DWELL` needs more proofs than `WATCH`.
 
     A device file never allows motion or tables, whatever its test proves: these need a driver, whose banks, read-back and
     compare-and-swap `abbe comp commission` proves.
@@ -25,7 +25,7 @@ class Ability(StrEnum):
     WATCH = "watch"
     """Its values can be shown."""
     DWELL = "dwell"
-    """Its readings count: at standstills of an operator's NC program, or of a motion that Abbe commands."""
+    """Measurements may use its readings at standstills of an operator's NC program, or of a motion that Abbe commands."""
 
 
 class CheckVerdict(StrEnum):

@@ -119,7 +119,7 @@ class ModbusReply:
 
 
 TURNS_TO_OPEN = 2
-"""Turns of the event loop after which pymodbus knows a serial port that it has opened."""
+"""Turns of the event loop until pymodbus can close a serial port that it has just opened."""
 
 
 class ModbusWire:

@@ -189,7 +189,7 @@ def is_url_of(role: str, text: str) -> bool:
 
 
 def described_by(url: DeviceUrl) -> Description:
-    """Return the device file and the test report that a URL names; the result is false if the URL names no device file."""
+    """Return the device file and the test report that a URL names; ``bool`` of the result is False if the URL names no device file."""
     return NOT_DESCRIBED if isinstance(url, FixtureTcpUrl | FixtureConsoleUrl) else url.description
 
 
