@@ -52,18 +52,18 @@ TICK_S = 0.005
 REST_S = 0.2
 """Time between two ticks while nothing streams or is buffered. This suffices because every request brings the world up to date."""
 AHEAD_S, AHEAD_SAMPLES = 10.0, 2000
-"""Simulated time, and samples, by which a world that is faster than real time runs ahead of a host that watches it."""
+"""Largest lead, in s of simulated time and in samples, of a world faster than real time over a host that polls the controller."""
 WAITS_S = 0.5
-"""Wall time for which it waits: who does not ask for longer does not watch, and after a second without a sample the box is silent."""
+"""Longest wait for the next poll, s of wall time; after a second without samples the host would report a silent box."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"
 
 
 class Site:
     """All connections of one simulated world. Simulated time = speed x wall time since ``start``.
 
-    A world that is faster than real time waits for its host: while samples stream and a connected host has asked the controller, it runs
-    on for `AHEAD_S` at most until the next question, or for `WAITS_S` of wall time. At 60 times, a host that gets no core for 0.4 s would
-    be 24 s late.
+    A world that is faster than real time waits for a host that polls the controller while samples stream: `AHEAD_S` after a
+    poll it stops until the next poll, or for `WAITS_S` of wall time. Otherwise, at 60 times real time, a host that gets no core for 0.4 s
+    would be 24 s late.
     """
 
     def __init__(self, scenario: Scenario, link_dir: Path | None = None) -> None:

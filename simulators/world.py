@@ -23,7 +23,7 @@ LASER_CLOCK_US = 987_654_321
 class World:
     """Everything that is simulated, at one instant ``time_s`` (s since the controller was switched on).
 
-    Nothing here sleeps or knows wall time. Commands to the devices take effect at ``time_s``.
+    Nothing here sleeps or reads the wall clock. Commands to the devices take effect at ``time_s``.
     """
 
     def __init__(self, scenario: Scenario) -> None:

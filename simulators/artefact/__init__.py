@@ -1,1 +1,1 @@
-"""A plate of holes or balls on the simulated table, and the touch probe that feels it."""
+"""A plate of holes or balls on the simulated table, and the touch probe that measures it."""

@@ -1,4 +1,4 @@
-"""Artefact on the table: a plate, and a sphere next to it, that the probe in the spindle can touch after the fixture has mounted them."""
+"""The plate and the qualification sphere on the table, and the probe in the spindle that touches them after mounting by the fixture."""
 
 from collections.abc import Callable
 from dataclasses import replace

@@ -115,7 +115,7 @@ class BallbarDevice:
         )
 
     def forget_settings(self) -> None:
-        """Reset the settings to the ones of a box just switched on."""
+        """Reset the settings to those of a box that was just switched on."""
         self.settle()
         self.settings = Settings()
 

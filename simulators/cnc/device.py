@@ -260,7 +260,7 @@ class Controller:
 
     @property
     def fifo_free(self) -> int:
-        """Number of path points that still fit; points that wait, and those that the running path has not reached, take room."""
+        """Free places for path points: the total minus waiting points and points that the running path has not reached."""
         waiting = len(self._fifo)
         if self.path_running and self._motion is not None:
             waiting += self._motion.vertex_count - self.path_points_done

@@ -24,7 +24,7 @@ INDISTINCT = 20.0
 COMPONENTS = "XYZABC"
 DRIFT_S = (1500.0, 3000.0, 6000.0)
 Function = Callable[[Track], F]
-"""Returns the value of some quantity at every reading of a run, (n,)."""
+"""Returns a quantity at every reading of a run, (n,)."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return one column of readings per function, which displaces the tool along an axis and has to be 0 where a cup is set up."""
+        """Return the readings, mm, of displacements along an axis: one column per function, which must be 0 where a cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:
@@ -52,7 +52,7 @@ class FittedRuns:
             yield self.stack(lambda r, tau=tau: _warm(r, direction, arm, tau))  # type: ignore[misc]
 
     def of_instruments(self, bar: Function | None, laser: Function | None) -> F:
-        """Return the readings of an effect of the instruments themselves; None: the effect leaves this instrument alone."""
+        """Return the readings of an effect of the instruments themselves; None: this instrument is not affected."""
         return self.stack(lambda r: _instrument(r, bar if r.track.kind == "bar" else laser))
 
     def motion(self, carriage: int, component: int) -> F:

@@ -1,1 +1,1 @@
-"""The sealed truth: the real motion of the machine. Instruments get to know it only through readings."""
+"""The sealed truth: the real motion of the machine, which only the simulated instruments read."""
