@@ -66,8 +66,8 @@ PAGE_ROWS = 60
 class Parts:
     """Sources of the routes that need a core: jobs, live events, metrics.
 
-    ``recipes``: can be started; ``plans``: can be rehearsed in dry runs; ``campaigns``: recipes that end with a proposal; ``control``:
-    identity of the machine's control, empty if unknown; ``pushes_itself``: the service pushes what is approved.
+    ``recipes``: those that can be started; ``plans``: dry runs that can be shown; ``campaigns``: recipes that end with a proposal;
+    ``control``: identity of the machine's control, empty if unknown; ``pushes_itself``: the service itself pushes approved tables.
     """
 
     core: CoreLine

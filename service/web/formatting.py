@@ -13,7 +13,7 @@ _SPAN = re.compile(r"`?" + _NAME + r"[^`;,。]*`?")
 _ASIDE = re.compile(r" ?[(（][^()（）]*" + _NAME + r"[^()（）]*[)）]")
 _PARTS = re.compile(r"((?<=[;.]) |(?<=。))")
 _MOST_WORDS = 4
-"""A part of a text with more words beside its command says something else, too, and stays."""
+"""A part of a text with more words than this besides its command has other content, too, and is kept."""
 
 
 def stamp(time: datetime, zone: tzinfo = UTC) -> str:
@@ -39,9 +39,9 @@ def number(value: float | None) -> str:
 
 
 def without_commands(text: str) -> str:
-    """Return a text without the brackets and parts that only name a command of the command line: a person at the page has none.
+    """Return a text without the brackets and parts that only name a command, because the page has no command line.
 
-    A part that says more stays whole: it may hold a cause, or what to do first.
+    A part with other content is kept whole: it may state a cause, or what to do first.
     """
     if not _COMMAND.search(text):
         return text

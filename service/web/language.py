@@ -1,6 +1,6 @@
 """The texts of the screens in four languages: one catalogue file each, all with the same keys and placeholders.
 
-Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.service.rendering.phrases` translates those that it knows.
+Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.service.rendering.phrases` has their translations.
 """
 
 from __future__ import annotations

@@ -16,7 +16,7 @@ from abbe.service.web.schemas import Problem
 
 MEDIA_TYPE = "application/problem+json"
 LONGEST = 1000
-"""Largest length of a detail, which may repeat client input, characters."""
+"""Largest length of a detail, in characters: a detail may repeat client input."""
 
 
 def problem(status: int, detail: str, code: str = "", headers: dict[str, str] | None = None) -> JSONResponse:

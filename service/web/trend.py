@@ -14,7 +14,7 @@ from abbe.service.web.formatting import number
 WIDTH, HEIGHT = 560, 230
 LEFT, RIGHT, TOP, BOTTOM = 58, 40, 16, 40
 MANY = 120
-"""More points than this stand too close to be pointed at: those that look alike are one path."""
+"""Above this number, points are too close for a pointer, and points that look alike are drawn as one path."""
 
 
 @dataclass(frozen=True, slots=True)

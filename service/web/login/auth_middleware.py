@@ -49,8 +49,8 @@ class Visit:
 class AuthMiddleware:
     """Passes allowed requests on to ``app``.
 
-    ``routes`` is read at each request, so later routes count too. Without ``auth`` there are no users: every visitor is an onlooker, and
-    no request may change anything.
+    ``routes`` is read at each request, so it may grow later. Without ``auth`` there are no users: every visitor may look, and no request
+    may change anything.
     """
 
     def __init__(self, app: ASGIApp, routes: Sequence[BaseRoute], auth: Authenticator | None) -> None:

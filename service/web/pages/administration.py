@@ -1,6 +1,6 @@
 """Administration on the page: limits, schedules, certificates, laboratory and customer, each a form that changes the machine file.
 
-The page only asks; the core checks the right and the file, writes the audit and the file, and starts anew with the changed values.
+The page only sends requests; the core checks permission and file, writes the audit and the file, and starts anew with the new values.
 """
 
 from __future__ import annotations

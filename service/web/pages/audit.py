@@ -1,4 +1,4 @@
-"""The audit in a person's words: who did what to what, and how it ended. What the program recorded stands below, as it is."""
+"""The audit in words for people: who did what to which object, with which outcome. The record itself is shown below, unchanged."""
 
 from __future__ import annotations
 
@@ -72,7 +72,7 @@ DEEDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "demo": ("abbe demo",),
     }
 )
-"""The recorded actions of each deed; the catalogues hold its words under ``deed``."""
+"""The recorded actions of each deed; the catalogues name the deed under ``deed``."""
 _OF = {action: deed for deed, actions in DEEDS.items() for action in actions}
 _ENDS = {"done": "ok", "kept": "ok", "refused": "bad", "failed": "bad", "rolled back": "bad"}
 _JOB = re.compile(r"^job [0-9a-f]+(, )?")
@@ -93,7 +93,7 @@ class Deed:
 
 
 def deed(record: AuditEntry) -> Deed:
-    """A record in the reader's language; what has no words stays as it was recorded."""
+    """A record in the reader's language; actions without a translation are shown as recorded."""
     known = _OF.get(record.action)
     what = record.action if known is None else current().translate(f"deed.{known}")
     end, sign = _end(record.outcome)

@@ -195,7 +195,7 @@ LEFT, RIGHT, MIDDLE = 2.0, 14.0, 22.0
 
 def gauge_svg(title: str, value: float, expanded: float | None, limit: float | None, verdict: str) -> str:
     """Return the bar of a gauge, from zero to beyond limit and value. All numbers in one unit; ``expanded``: U, None if unknown;
-    ``title``: its text."""
+    ``title``: text of the bar."""
     u = expanded or 0.0
     top = max(1.15 * (limit or 0.0), 1.1 * (abs(value) + u), 1e-12)
 

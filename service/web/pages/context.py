@@ -32,7 +32,7 @@ Number = Annotated[int | None, Query(ge=1, le=LARGEST)]
 class PageContext:
     """Sources of the screens. ``rules``: limits and certificates of the machine file, so that a screen judges as the report does.
 
-    ``pushes_itself``: the service pushes what is approved, and takes no order to push; ``recipes``: checks that a schedule may name.
+    ``pushes_itself``: the service itself pushes approved tables, and takes no order to push; ``recipes``: checks that a schedule may name.
     """
 
     env: Environment

@@ -1,6 +1,6 @@
-"""Fields of the forms that change the machine file: what they show of it, and which changes a sent form asks for.
+"""Fields of the forms that change the machine file: the values that they show, and the changes that a sent form requests.
 
-A field only turns what a person typed into JSON. Bounds and words are judged by the parser of the machine file alone.
+A field only converts typed text to JSON. The parser of the machine file alone checks bounds and allowed words.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
 from abbe.service.web.frame import current
 
 Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many", "times"]
-"""``optional``: a text, ``maybe``: a number, that may be absent; ``range``: two numbers; ``yes``: yes or no; ``many``: boxes to tick;
-``times``: days and a time of day, or a cron expression, or neither."""
+"""``optional``: a text that may be absent; ``maybe``: a number that may be absent; ``range``: two numbers; ``yes``: yes or no;
+``many``: boxes to tick; ``times``: days and a time of day, or a cron expression, or neither."""
 _NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
 _KEY = re.compile(r"\b(issuer|item|verify|limits|calibration|schedule)(?:\[([^\]]*)\])?(\.[a-z_.]*[a-z_])")
 ENDS = ("low", "high")
 DAYS = {"daily": "*", "workdays": "1-5", "mon": "1", "tue": "2", "wed": "3", "thu": "4", "fri": "5", "sat": "6", "sun": "0"}
-"""Days of a schedule as they are chosen, and as a cron expression has them."""
+"""Choices for the days of a schedule, and their field of a cron expression."""
 _TIME = re.compile(r"([01]\d|2[0-3]):[0-5]\d")
 _ONE_TIME = re.compile(r"(\d|[1-5]\d) (\d|1\d|2[0-3]) \* \* (\*|1-5|[0-6])")
 
@@ -116,7 +116,7 @@ class ShownField:
 
     @property
     def options(self) -> tuple[str, ...]:
-        """What can be chosen; a value that is no option any more stays one."""
+        """What can be chosen, including a present value that is no longer an option."""
         return tuple(dict.fromkeys((*self.field.options, *(text for text in self.texts if text and self.field.kind == "choice"))))
 
 
@@ -147,7 +147,7 @@ def _texts(field: Field, value: Any) -> tuple[str, ...]:
 
 
 class FormError(ValueError):
-    """Fields of a form contradict each other. ``key``: what to do, in the catalogues."""
+    """Fields of a form contradict each other. ``key``: key of the remedy in the catalogues."""
 
     def __init__(self, key: str) -> None:
         super().__init__(key)
@@ -155,7 +155,7 @@ class FormError(ValueError):
 
 
 def _times(cron: str | None) -> tuple[str, str, str]:
-    """Days, time of day and expression as a form shows a cron expression; empty: by interval; None: a new schedule, nothing is chosen."""
+    """Days, time of day and expression with which a form shows a cron expression; empty: interval; None: new schedule, nothing chosen."""
     if not cron:
         return "" if cron is None else "interval", "", ""
     found = _ONE_TIME.fullmatch(cron)
@@ -166,7 +166,7 @@ def _times(cron: str | None) -> tuple[str, str, str]:
 
 
 def _cron(key: str, expression: str, form: Mapping[str, str]) -> str | None:
-    """The cron expression that a form asks for. Raises FormError if it is not the only rule in the form."""
+    """The cron expression that a form requests. Raises FormError if it is not the only rule in the form."""
     days, time = form.get(f"{key}.days"), form.get(f"{key}.time", "").strip()
     interval = form.get(f"{key.removesuffix('cron')}every_h", "").strip()
     if days is None:
@@ -188,7 +188,7 @@ def _text(value: Any) -> str:
 
 
 def edits_of(fields: Sequence[Field], form: Mapping[str, str], stated: MachineFileSummary) -> tuple[FileEdit, ...]:
-    """The changes that a sent form asks for: values that differ from those in force. Fields that the form lacks change nothing.
+    """The changes that a sent form requests: values that differ from those in force. Fields that the form lacks change nothing.
 
     Raises FormError if fields contradict each other.
     """
@@ -205,7 +205,7 @@ def edits_of(fields: Sequence[Field], form: Mapping[str, str], stated: MachineFi
 
 
 def _whole(found: list[FileEdit], fields: Sequence[Field], form: Mapping[str, str], known: Mapping[str, Any]) -> tuple[FileEdit, ...]:
-    """A laboratory without any name is removed; a chosen place alone makes none."""
+    """Remove a laboratory without any name, even if its place is chosen."""
     if ISSUER[0] in fields:
         named = any(form.get(one.key, "").strip() for one in ISSUER if one.kind == "text")
         if not named and ISSUER[0].key in form:
@@ -219,7 +219,7 @@ def _names(field: Field) -> tuple[str, ...]:
 
 
 def _sent(field: Field, form: Mapping[str, str]) -> Any:
-    """What a form has for a field, as JSON; None: nothing. What is no number stays text, which the parser refuses with its own words."""
+    """The value of a field in a form, as JSON; None if empty. Text in place of a number stays text, which the parser refuses."""
     text = form.get(field.key, "").replace("\r\n", "\n").strip()
     match field.kind:
         case "number" | "maybe":
@@ -244,7 +244,7 @@ def _number(text: str) -> Any:
 
 
 def with_names(text: str) -> str:
-    """A text with the names that the forms have for keys of the machine file."""
+    """A text with keys of the machine file replaced by the names of their fields."""
     frame = current()
 
     def name(found: re.Match[str]) -> str:

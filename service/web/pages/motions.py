@@ -153,7 +153,7 @@ def _chosen(
 
 
 def _runs(store: Store, record: SolutionRecord, stored: StoredField, solution: SolutionFile, motion: str) -> list[RunLine]:
-    """The runs of a solution, the most telling first."""
+    """The runs of a solution, the most informative first."""
     records = {one.label: one for one in store.runs.all(record.campaign_id)}
     used = [label for label in solution.runs if label in records]
     runs = tuple(run_data(run) for run in with_earliest_mounting([load_run(store, records[label].id) for label in used]))

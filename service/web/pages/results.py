@@ -116,8 +116,9 @@ class SolutionLine:
 
 @dataclass(frozen=True, slots=True)
 class ResultScreen:
-    """One solution. ``campaign_id``: number of its campaign, whose report holds it. ``ranked``: empty if its document lacks the covariance;
-    ``picture``: contributions that the runs show; ``runs``: the number of each run (None: it is not stored here), and its cells.
+    """One solution. ``campaign_id``: number of its campaign, whose report contains the solution. ``ranked``: empty if the
+    solution lacks the covariance; ``picture``: contributions that the runs show; ``runs``: number of each run (None: it is not stored
+    here), and its cells.
     """
 
     line: SolutionLine

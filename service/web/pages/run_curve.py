@@ -22,7 +22,7 @@ PARTS = 1000
 def envelope(x: F1, y: F1, low: float, high: float) -> tuple[F1, F1, F1]:
     """Middle, least and largest reading of each part of ``x`` from ``low`` to ``high``; the readings themselves if there are few.
 
-    ``x``: growing, shape (n,). The last reading before and the first one after are included, so that lines reach the edges.
+    ``x``: ascending, shape (n,). The last reading before and the first one after are included, so that lines reach the edges.
     """
     first = max(int(np.searchsorted(x, low)) - 1, 0)
     last = min(int(np.searchsorted(x, high, side="right")) + 1, len(x))

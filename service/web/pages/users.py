@@ -1,4 +1,4 @@
-"""Users on the page: an admin adds, disables and changes users, each person the own password and PIN. `abbe user` calls the same
+"""Users on the page: an admin adds, disables and changes users; everybody changes the own password and PIN. `abbe user` calls the same
 functions."""
 
 from __future__ import annotations

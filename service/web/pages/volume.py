@@ -22,7 +22,7 @@ from abbe.service.web.frame import current
 NODES = (3, 4, 5, 6)
 """Nodes per axis. More would make the table too large for a screen; the HTTP interface gives finer grids."""
 STILL, STILL_UM = "0", 1e-9
-"""Text of a component that the chosen motions cannot change: its uncertainty, µm, is at most the second value, which is rounding."""
+"""Text of a component that the chosen motions do not affect; largest uncertainty, µm, of such a component (rounding)."""
 Translate = Callable[..., str]
 NOTHING = Markup("")
 

@@ -31,9 +31,9 @@ Translate = Callable[..., str]
 
 @dataclass(frozen=True, slots=True)
 class EffectChoice:
-    """An error that can count as corrected.
+    """An error that a person can take as corrected.
 
-    ``text``: name for people; ``reason``: why it cannot be chosen alone, empty if it can; ``selected``: whether it counts as corrected.
+    ``text``: name for people; ``reason``: why it cannot be chosen alone, empty if it can; ``selected``: whether it is taken as corrected.
     """
 
     name: str
@@ -69,7 +69,7 @@ class WhatIfScreen:
 
     @property
     def any_selected(self) -> bool:
-        """Whether anything counts as corrected."""
+        """Whether any error is taken as corrected."""
         return self.everything or any(c.selected for c in (*self.means, *self.motions))
 
     @property
