@@ -23,7 +23,7 @@ class StatedInputs:
     Attributes
     ----------
     u_wavelength : float
-        Relative standard uncertainty of the laser's wavelength after air compensation; all runs share one laser. This input counts only if
+        Relative standard uncertainty of the laser's wavelength after air compensation; all runs share one laser. This input is used only if
         the wavelength is not an unknown of the solution.
     u_scale_temperature_k, scale_expansion_per_k : float
         Standard uncertainty of each scale's temperature, K, and expansion coefficient of the scales, 1/K. 0.2 K stands for a Pt100 on the

@@ -19,7 +19,7 @@ Draw = Callable[[np.random.Generator, int], F2]
 BATCH = 10_000
 """Fewest trials of one batch; 100 / (1 - p) where that is more (GUM-S1 7.9.4)."""
 FEWEST_BATCHES = 10
-"""Fewest batches: the spread of ten is known to a quarter, while that of two is below a tenth of its true size in one case of twelve."""
+"""Fewest batches: ten show their spread to 25 %, while two show less than a tenth of it in one case of twelve."""
 LARGEST = 1_000_000
 VALIDATION_SHARE = 0.2
 """Trials that check the law of propagation must be known to this fraction of the check's tolerance (GUM-S1 8.2)."""

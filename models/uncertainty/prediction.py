@@ -358,7 +358,7 @@ def compensable_mask(prediction: Prediction, *, k: float | None = None, smallest
     ----------
     prediction : Prediction
         Prediction in the frame of the correction. For a map this is the rigid-free frame (`abbe.models.geometry.volume`); otherwise a
-        displacement of the whole workpiece, which is not an error, would count.
+        displacement of the whole workpiece would be included, which is not an error.
     k : float, optional
         Coverage factor; default: that of the prediction's own probability and degrees of freedom.
     smallest_mm : float

@@ -2,7 +2,7 @@
 
 The estimate is linear in its inputs, theta = C A^T W y + C P^-1 m: readings y with weights W, prior means m with variances P,
 posterior covariance C. So the covariance splits exactly, C = C A^T W A C + C P^-1 C: into the noise of each instrument and the prior of
-each unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs that the solver does not know are added.
+each unknown (the bar's calibrated length, the set-ups, the typical size of errors). Inputs that the solver does not use are added.
 """
 
 from __future__ import annotations
@@ -257,7 +257,7 @@ FROM_READINGS = frozenset({"bar_noise", "laser_noise", "artefact_noise", "estima
 
 
 LASER_SCALE = "laser_scale"
-"""The solution's unknown for the wavelength, limited by its prior; for a solution without it, `StatedInputs.u_wavelength` counts."""
+"""The solution's unknown for the wavelength, limited by its prior; for a solution without it, `StatedInputs.u_wavelength` is used."""
 
 
 @dataclass(frozen=True)

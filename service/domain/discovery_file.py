@@ -75,7 +75,7 @@ class FoundTest(FileObject):
 
 
 class FoundAgreement(FileObject):
-    """Test of a run that was never fitted. ``times``: its rms over the allowed rms; ``p``: probability of so large an rms by chance."""
+    """Test of a run that was never fitted. ``times``: rms divided by the allowed rms; ``p``: probability of so large an rms by chance."""
 
     run: str
     times: float = Field(ge=0)

@@ -24,7 +24,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, slots=True)
 class RunPiece:
-    """An interrupted run, and the position on the whole path up to which its readings count, mm from the first point."""
+    """An interrupted run, and the position on the whole path up to which its readings are used, mm from the first point."""
 
     run: int
     to_mm: float
@@ -35,7 +35,7 @@ class CommandedPath:
     """The path of a ball-bar run, a polyline at constant feed.
 
     ``points_mm``: shape (n, 3), from the machine's position at the start of the path; ``measured``: numbers of the first and last point
-    between which readings count, None: all count. A path that was interrupted and resumed (`abbe.service.sequences.resume_plan`) begins
+    between which readings are used, None: all. A path that was interrupted and resumed (`abbe.service.sequences.resume_plan`) begins
     ``offset_mm`` behind the start of the whole path, and the readings of the interrupted ``pieces`` belong to it.
     """
 
@@ -73,7 +73,7 @@ class CommandedPath:
 
     @property
     def counted_mm(self) -> tuple[float, float]:
-        """Positions along this path between which readings count, mm from its first point."""
+        """Positions along this path between which readings are used, mm from its first point."""
         arc = self.arc_mm
         first, last = self.measured or (0, len(arc) - 1)
         return float(arc[first]), float(arc[last])

@@ -30,7 +30,7 @@ class SessionRecord(Row):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TokenRecord(Row):
-    """A token of a program, with those rights of its user that its scopes name."""
+    """A token of a program. Its scopes limit it to some rights of its user."""
 
     user_id: int
     name: str

@@ -62,7 +62,7 @@ class Columns:
 
     @classmethod
     def concatenated(cls, parts: Sequence[Columns]) -> Columns:
-        """The rows of several parts with the columns of the last one."""
+        """The rows of several parts, with the columns that the last part has."""
         last = parts[-1]
         sealed = last.deviation_mm is None
         return replace(

@@ -13,7 +13,7 @@ from abbe.service.formats.model import Compensation, correction_at
 
 REMEDY = "do not load this file"
 ALIKE = 0.2
-"""Tables count as a multiple of the expected ones if they differ from that multiple by less than this share."""
+"""Tables are taken as a multiple of the expected ones if they differ from that multiple by less than this share."""
 FACTORS = (
     (-1.0, "the sign is wrong: this file would double every error"),
     (1000.0, "1000 times too large: µm were taken for mm"),

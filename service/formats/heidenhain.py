@@ -32,7 +32,7 @@ STEEPEST = 64
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Write one .COM per input axis, and CONFIG.CMA with its only line active.
+    """Write one .COM per input axis, and CONFIG.CMA with one line, which is active.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def assignment(names: dict[str, str]) -> TextFile:
-    """Return the .CMA that assigns a file to each axis, with its only line active."""
+    """Return the .CMA that assigns a file to each axis, with one line, which is active."""
     head = "NR   " + "".join(f"{a:<12}" for a in AXES) + "ACTIVE"
     row = "0    " + "".join(f"{names.get(a, ''):<12}" for a in AXES) + "*"
     return TextFile(ASSIGNMENT, "\n".join([f"BEGIN {ASSIGNMENT}", head, row, "[END]"]) + "\n")

@@ -3,7 +3,7 @@
 A one-axis table becomes a lincurve; a product of two functions becomes two lincurves and a mult2. A lincurve has 2 to 16 points and holds
 its end values beyond them; ``halcmd setp`` changes it live. A chain of sum2 adds the corrections to the command of an axis and ends in the
 signal ``drive-x``, ``drive-y`` or ``drive-z``, which commands the servo; motor-pos-fb gets the command without corrections. The network
-does not know the direction of motion, so lost motion belongs in COMP_FILE. The file replaces the lines that connect motor-pos-cmd to
+has no input for the direction of motion, so lost motion belongs in COMP_FILE. The file replaces the lines that connect motor-pos-cmd to
 motor-pos-fb; load it after ``addf motion-controller``.
 """
 

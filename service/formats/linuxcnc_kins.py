@@ -1,7 +1,7 @@
 """LinuxCNC kinematics component: a 3-D grid of corrections as C source for ``halcompile --install`` (abbekins.c).
 
 The whole field acts, trilinear between the nodes, at the commanded position. A HAL pin puts it in force and takes it back while the machine
-stands, without a restart. The component does not know the direction of motion: lost motion goes into [JOINT_n] BACKLASH. The numbers are
+stands, without a restart. The component has no input for the direction of motion: lost motion goes into [JOINT_n] BACKLASH. The numbers are
 constants of the program, so no file can be missing or belong to another table when the control starts.
 """
 
@@ -62,7 +62,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
     Raises
     ------
     TableFileError
-        Counts, first positions or steps are missing, a node has no three numbers, or the nodes are not as many as stated.
+        Counts, first positions or steps are missing, a node lacks one of its three numbers, or the number of nodes is not the stated one.
     """
     file = files[0]
     found: dict[str, F1] = {}

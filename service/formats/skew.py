@@ -63,7 +63,7 @@ def lengths_of(factor: float) -> tuple[float, float, float]:
 
 
 def write(comp: Compensation, settings: FormatSettings, *, dialect: SkewProgram) -> tuple[TextFile, ...]:
-    """Write the commands in one file, with those that take them back.
+    """Write the commands in one file, and the commands that cancel them.
 
     Raises
     ------

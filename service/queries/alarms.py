@@ -1,6 +1,6 @@
-"""Alarms for people: the history of an alarm with the persons behind it, the alarms of a check, and the way from an alarm to a report.
+"""Alarms for people: the history of an alarm with the persons behind it, the alarms of a check, and the steps from an alarm to a report.
 
-The way (check, cause, proposal, approval, push, proof, report) follows from the store alone.
+The steps (check, cause, proposal, approval, push, proof, report) follow from the store alone.
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ Result = TypeVar("Result", bound=StoredResult)
 Step = Literal["alarm", "check", "cause", "proposal", "approval", "push", "proof", "report"]
 StepState = Literal["done", "now", "waiting", "failed", "skipped"]
 SEARCHED = ("EXPLAINED", "PROPOSED", "FITTED", "UNEXPLAINED")
-"""States of a search that has found a cause, or has excluded all causes that it knows."""
+"""States of a search that has found a cause, or has excluded all known causes."""
 APPROVED = ("approved", "pushed", "kept", "rolled back")
 LATEST = 20
 MOST_PATHS = 5
@@ -116,7 +116,7 @@ def _alarms(reader: Reader) -> list[tuple[Alarm, list[AlarmEntryRecord]]]:
 
 
 class _AlarmHistory:
-    """Stored records about the steps of one alarm. Records that name the alarm count first, then later records."""
+    """Stored records about the steps of one alarm. Records that name the alarm are used first, then later records."""
 
     def __init__(self, reader: Reader, entries: Sequence[AlarmEntryRecord]) -> None:
         self._reader, self._entries = reader, entries

@@ -44,7 +44,7 @@ class CampaignSummary:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunSummary(RunFacts):
-    """One measured sequence. ``status`` as people see it: a run whose process died counts as incomplete."""
+    """One measured sequence. ``status`` as people see it: a run whose process died is incomplete."""
 
     number: int
     machine: str

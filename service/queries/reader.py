@@ -65,7 +65,7 @@ class Reader:
         return rows[:limit], rows[limit - 1].number if len(rows) > limit else None
 
     def row(self, kind: str, number: int, what: str) -> PageRow:
-        """Return one row with its document; ``what`` names the thing in the error. Raises NotStored."""
+        """Return one row with its document; ``what`` names the kind of object in the error. Raises NotStored."""
         found = self.store.pages.row(kind, number)
         if found is None:
             raise NotStored(f"there is no {what} {number}")
