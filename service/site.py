@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from datetime import date
 from typing import Any
@@ -134,3 +134,20 @@ def check_certificates(site: Site) -> None:
         raise TableRefused(
             "the instruments have no calibration certificate", "name them under [calibration] in the machine file; nothing was measured"
         )
+
+
+INSTRUMENTS = {"ballbar": "ball-bar", "laser": "laser", "artefact": "artefact", "room": "room"}
+"""Instruments that have a certificate (`abbe.service.domain.run.Run.instrument`), in words."""
+
+
+def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
+    """Return messages about expired certificates of these instruments."""
+    return [
+        f"the certificate of the {INSTRUMENTS[role]} ended on {day}: what is measured now goes into no table ([calibration] {role})"
+        for role, day in ended_certificates(site, today, roles).items()
+    ]
+
+
+def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> dict[str, date]:
+    """Return the last valid days of the expired certificates of these instruments, by role."""
+    return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}

@@ -15,10 +15,10 @@ from abbe.service.domain.run import Run
 from abbe.service.domain.run_file import CAMPAIGN_FORMAT
 from abbe.service.domain.solution_file import TableRemoval
 from abbe.service.errors import CampaignRefused, Unusable
-from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.checks import read_json
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import import_folder, read_folder, write_folder
+from abbe.service.runs.observations import with_earliest_mounting
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.store import Store
 

@@ -15,12 +15,12 @@ from abbe.service.devices.session import Session
 from abbe.service.errors import BeamLost, Interlock, RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.columns import path_progress
 from abbe.service.runs.pieces import ReadProgress
-from abbe.service.sequences.control import Control, State, Suspending, Watching, check_interlocks
+from abbe.service.sequences.control import Control, ExpectedTable, State, Suspending, Watching, check_expected, check_interlocks
 from abbe.service.sequences.journal import DONE, WAITS, Journal, RunLine, lines_of
 from abbe.service.sequences.resume_plan import Attempt, PathRemainder, ResumeTrail, anew, end_of, remounted, rest_of
 from abbe.service.sequences.runner import Runner
 from abbe.service.sequences.steps import CampaignPlan, ReadBar, RecordPath, TestPlan
-from abbe.service.sequences.waiting import ExpectedTable, check_expected, may_suspend, paused, suspended
+from abbe.service.sequences.waiting import may_suspend, paused, suspended
 from abbe.service.storage.store import Store
 
 BALLBAR = "ballbar"

@@ -1,4 +1,4 @@
-"""Checks of a campaign's devices before anything moves: they are configured, they answer, and they have the needed rate and range.
+"""The devices that a campaign needs, and their checks before anything moves: configured, answering, with the needed rate and range.
 
 The laser check takes a reading and ignores the beam, which is aligned and zeroed only when the laser is mounted during the campaign.
 """
@@ -7,16 +7,28 @@ from __future__ import annotations
 
 import asyncio
 import math
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Collection
+from dataclasses import dataclass, field
+from typing import Any
 
 from abbe.drivers.api import LaserReading
 from abbe.drivers.errors import DriverError, ReplyTimeout, WrongDevice
 from abbe.drivers.fixture.driver import ConsoleFixture
-from abbe.service.campaigns.plausibility import BALLBAR, CNC, FIXTURE, LASER, Needed, check_configured, needed_by
 from abbe.service.devices.session import Session, raise_all
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.probing import need_probe
-from abbe.service.sequences.steps import CampaignPlan, TouchFeature
+from abbe.service.sequences.resume_plan import BY_HAND
+from abbe.service.sequences.steps import (
+    CampaignPlan,
+    ChangeBar,
+    MountBar,
+    MountLaser,
+    ReadBar,
+    ReadLaser,
+    RecordPath,
+    TouchFeature,
+    ZeroLaser,
+)
 
 BEFORE_S = 5.0
 """Longest search for the ball-bar's box before a run."""
@@ -27,6 +39,43 @@ LASER_S = 2.0
 POLL_S = 0.02
 AIR_C, AIR_PA = (-20.0, 60.0), (50_000.0, 120_000.0)
 """Plausible readings of the laser's sensors in a workshop. Outside them a sensor is broken, and every length is wrong."""
+CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
+ROLE_NAMES = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}
+USED_BY: dict[str, Any] = {
+    BALLBAR: MountBar | ChangeBar | RecordPath | ReadBar,
+    LASER: MountLaser | ZeroLaser | ReadLaser,
+    FIXTURE: BY_HAND,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Needed:
+    """Devices of a campaign. ``first``: role -> its first use; ``rate_hz``: fastest stream of the ball-bar, 0: none."""
+
+    first: dict[str, str] = field(default_factory=dict)
+    rate_hz: int = 0
+
+
+def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
+    """Return the devices that the steps of a campaign use; watching the ``air`` (``run_temperature_c``) needs the laser's sensor."""
+    first = {CNC: "all motion"}
+    for role, kinds in USED_BY.items():
+        test = next((t for t in plan.tests if any(isinstance(s, kinds) for s in t.steps)), None)
+        if test is not None:
+            first[role] = f"test {test.label}"
+    if air:
+        first.setdefault(LASER, "run_temperature_c")
+    rates = [step.rate_hz for test in plan.tests for step in test.steps if isinstance(step, RecordPath | ReadBar)]
+    return Needed(first, max(rates, default=0))
+
+
+def check_configured(needed: Needed, there: Collection[str]) -> None:
+    """Raise ConfigError if needed roles are not in ``there``, the roles that the machine file names. Connects to nothing."""
+    missing = [role for role in needed.first if role not in there]
+    if missing:
+        listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)
+        keys = ", ".join(f"{role} = ..." for role in missing)
+        raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
 
 
 async def check_devices(session: Session, plan: CampaignPlan, *, air: bool = False) -> None:

@@ -34,14 +34,13 @@ from abbe.service.domain.measured import DISK_FULL, RunStart, RunTable, this_pro
 from abbe.service.domain.progress import Progress, ProgressSink, ignore_progress
 from abbe.service.errors import AbbeError, Aborted, ConfigError, DiskFull, RunInterrupted, Stopped, StoreError
 from abbe.service.sequences.check import dry_run_campaign, step_seconds
-from abbe.service.sequences.control import Control, State
+from abbe.service.sequences.control import Control, ExpectedTable, State
 from abbe.service.sequences.journal import BEGUN, ENDED, RUN, Journal, NoJournal, StoreJournal
 from abbe.service.sequences.paths import warnings_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import Attempt, PathRemainder
 from abbe.service.sequences.runner import Runner, Tick
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
-from abbe.service.sequences.waiting import ExpectedTable
 from abbe.service.sequences.watch import IncidentNotes, incidents_noted, run_named
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

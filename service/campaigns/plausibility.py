@@ -1,4 +1,4 @@
-"""Checks that connect to nothing: the devices that a campaign needs, and faults and probable mistakes of a machine file.
+"""Checks of a machine file that connect to nothing: faults, and probable mistakes.
 
 Errors and probable mistakes in a machine file are found at once, not by the schedule at night. `abbe.service.config_schema` refuses
 impossible values (a stroke of 1e9 mm, 68 degrees C) when it reads the file.
@@ -6,79 +6,30 @@ impossible values (a stroke of 1e9 mm, 68 degrees C) when it reads the file.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
-from typing import Any
 
 from abbe.drivers.device_file import load
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import FixtureConsoleUrl, described_by, installed, parse_url
+from abbe.service.campaigns.device_checks import BALLBAR, CNC, LASER, check_configured, needed_by
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.sequences.check import dry_run_campaign, paced
 from abbe.service.sequences.recipes.campaigns import campaign_source, recipe_plan
-from abbe.service.sequences.resume_plan import BY_HAND
 from abbe.service.sequences.steps import (
     CampaignPlan,
-    ChangeBar,
-    MountBar,
-    MountLaser,
-    ReadBar,
-    ReadLaser,
-    RecordPath,
-    ZeroLaser,
 )
-from abbe.service.site import Site, site_of
-
-CNC, BALLBAR, LASER, FIXTURE = "cnc", "ballbar", "laser", "fixture"
-ROLE_NAMES = {CNC: "a controller", BALLBAR: "a ball-bar", LASER: "a laser", FIXTURE: "a fixture"}
-USED_BY: dict[str, Any] = {
-    BALLBAR: MountBar | ChangeBar | RecordPath | ReadBar,
-    LASER: MountLaser | ZeroLaser | ReadLaser,
-    FIXTURE: BY_HAND,
-}
-
-
-@dataclass(frozen=True, slots=True)
-class Needed:
-    """Devices of a campaign. ``first``: role -> its first use; ``rate_hz``: fastest stream of the ball-bar, 0: none."""
-
-    first: dict[str, str] = field(default_factory=dict)
-    rate_hz: int = 0
-
-
-def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
-    """Return the devices that the steps of a campaign use; watching the ``air`` (``run_temperature_c``) needs the laser's sensor."""
-    first = {CNC: "all motion"}
-    for role, kinds in USED_BY.items():
-        test = next((t for t in plan.tests if any(isinstance(s, kinds) for s in t.steps)), None)
-        if test is not None:
-            first[role] = f"test {test.label}"
-    if air:
-        first.setdefault(LASER, "run_temperature_c")
-    rates = [step.rate_hz for test in plan.tests for step in test.steps if isinstance(step, RecordPath | ReadBar)]
-    return Needed(first, max(rates, default=0))
-
-
-def check_configured(needed: Needed, there: Collection[str]) -> None:
-    """Raise ConfigError if needed roles are not in ``there``, the roles that the machine file names. Connects to nothing."""
-    missing = [role for role in needed.first if role not in there]
-    if missing:
-        listed = " and ".join(f"{ROLE_NAMES[role]} for {needed.first[role]}" for role in missing)
-        keys = ", ".join(f"{role} = ..." for role in missing)
-        raise ConfigError(f"this needs {listed}, and the machine file names none", f"add {keys} under [devices]")
-
+from abbe.service.site import INSTRUMENTS, Site, certificates, site_of
 
 SMALL_MM, LARGE_MM = 200.0, 20_000.0
 """A longest axis outside these limits is possible but rare."""
 ROOM_C = (10.0, 35.0)
 """A window of the air temperature beyond this is possible but rare."""
 LONG_VALID_YEARS = 10
-INSTRUMENTS = {BALLBAR: "ball-bar", LASER: "laser", "artefact": "artefact", "room": "room"}
-"""Instruments that have a certificate (`abbe.service.domain.run.Run.instrument`), in words."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -131,19 +82,6 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
                 entry, site, lambda: paced(campaign_source(config.alarm.campaign, folder).plan(site.machine), site.max_feed_mm_min)
             )
     return list(dict.fromkeys(found))
-
-
-def certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> list[str]:
-    """Return messages about expired certificates of these instruments."""
-    return [
-        f"the certificate of the {INSTRUMENTS[role]} ended on {day}: what is measured now goes into no table ([calibration] {role})"
-        for role, day in ended_certificates(site, today, roles).items()
-    ]
-
-
-def ended_certificates(site: Site, today: date, roles: Iterable[str] = INSTRUMENTS) -> dict[str, date]:
-    """Return the last valid days of the expired certificates of these instruments, by role."""
-    return {role: day for role, day in site.calibrated_until.items() if role in roles and day < today}
 
 
 def _lines(entry: Schedule, site: Site, plan: Callable[[], CampaignPlan]) -> list[str]:

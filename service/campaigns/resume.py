@@ -27,12 +27,11 @@ from abbe.service.domain.artefact import ARTEFACT_TEST
 from abbe.service.domain.measured import RUNNING, CampaignRecord, CheckpointRecord
 from abbe.service.errors import PreconditionsChanged, UnsafeToMove
 from abbe.service.runs.chunks import LASER_CHANNEL, decode_json
-from abbe.service.sequences.control import check_interlocks, check_ours
+from abbe.service.sequences.control import ExpectedTable, check_expected, check_interlocks, check_ours
 from abbe.service.sequences.journal import BEGUN, ENDED, BegunLine, HandLine, RunLine, lines_of
 from abbe.service.sequences.recipes.campaigns import RecipeSource
 from abbe.service.sequences.resume_plan import anew, remounted
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.sequences.waiting import ExpectedTable, check_expected
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import copy
-from collections.abc import Sequence
-
 import typer
 
 from abbe.service.cli.administration.audit import audit, record_all
@@ -89,19 +86,3 @@ app.command("version", rich_help_panel=MANAGE)(version)
 
 record_all(app)
 give_form(app)
-
-
-def named_by(words: Sequence[str]) -> typer.Typer:
-    """Return the tree with only the command or group that the first word names; the whole tree if the word names none.
-
-    Reading the options of the sixty others takes a tenth of the time of a short command.
-    """
-    first = words[0] if words else ""
-    own = [one for one in app.registered_commands if one.name == first]
-    groups = [one for one in app.registered_groups if one.name == first]
-    if not own and not groups:
-        return app
-    found = copy.copy(app)
-    last = app.registered_commands[-1]  # of a single command typer would make no group
-    found.registered_commands, found.registered_groups = [*own, last] if own != [last] else app.registered_commands[-2:], groups
-    return found

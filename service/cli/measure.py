@@ -159,14 +159,20 @@ def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: 
 
     With a controller, `abbe.service.campaigns.measure` refuses such a measurement instead, after rolling back an interrupted push.
     """
-    from abbe.service.campaigns.plausibility import certificates, check_configured, needed_by, unattended
+    from abbe.service.campaigns.device_checks import check_configured, needed_by
     from abbe.service.clock import SystemClock
+    from abbe.service.site import certificates
 
     needed = needed_by(plan, air=site.watching.air_c is not None)
     if dry or site.urls.cnc is None:
         check_configured(needed, site.urls.named())
     today, probed = SystemClock().utc().date(), {"artefact"} if any(test.artefact for test in plan.tests) else set()
-    for line in (*certificates(site, today, {*needed.first, *probed}), *unattended(loaded.machine, site, loaded.path.resolve().parent)):
+    warnings = certificates(site, today, {*needed.first, *probed})
+    if loaded.machine.schedule:
+        from abbe.service.campaigns.plausibility import unattended
+
+        warnings += unattended(loaded.machine, site, loaded.path.resolve().parent)
+    for line in warnings:
         typer.echo(f"warning: {line}", err=True)
 
 

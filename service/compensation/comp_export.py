@@ -31,7 +31,6 @@ from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import Compensation, negated
 from abbe.service.formats.registry import FORMATS, format_of
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.rendering.page_file import write_page
 from abbe.service.signed import keys
 from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
@@ -76,7 +75,7 @@ def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identifie
             raise FileFormatError(f"the solution holds no {what} (key {key!r})", "solve the campaign again: abbe solve")
     try:
         machine = machine_from_doc(doc["machine"])
-        terms, coefficients, _ = stored_prediction(StoredPrediction.read(doc["prediction"]))
+        terms, coefficients, _ = StoredPrediction.read(doc["prediction"]).unpacked()
         parameters = doc.get("parameters", {})
         lost = {a: parameters.get(f"backlash_{a}", {}) for a in AXES}
         observed = {a: float(v["value"]) for a, v in lost.items() if v and v["status"] != "not observable"}

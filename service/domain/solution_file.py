@@ -2,10 +2,16 @@
 
 from __future__ import annotations
 
+import base64
+from collections.abc import Iterable
 from typing import Literal
 
+import numpy as np
 from pydantic import Field, ValidationError
 
+from abbe.models.arrays import F1, F2
+from abbe.models.geometry.bases import Term
+from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import FileObject, MachineObject, Point
 from abbe.service.errors import Unusable
 
@@ -27,6 +33,15 @@ class TableInForce(FileObject):
 
     crc: int
     acting: bool | None = None
+
+
+def distinct(tables: Iterable[Doc]) -> list[TableInForce]:
+    """Return the tables of runs, sorted by CRC. ``acting``: whether the table corrects, as the controller states; None in older runs."""
+    acting: dict[int, bool | None] = {}
+    for table in tables:
+        crc, acts = int(table["crc"]), table.get("acting")
+        acting[crc] = acting.get(crc) if acts is None else bool(acts)
+    return [TableInForce(crc=crc) if (acts := acting[crc]) is None else TableInForce(crc=crc, acting=acts) for crc in sorted(acting)]
 
 
 class Inputs(FileObject):
@@ -192,6 +207,9 @@ class VerdictValue(FileObject):
     layout: str
 
 
+ENCODING = "base64 of float64, little endian, lower triangle by rows"
+
+
 class PackedMatrix(FileObject):
     """A symmetric matrix: ``data`` is base64 of its lower triangle by rows, float64, little endian."""
 
@@ -199,9 +217,25 @@ class PackedMatrix(FileObject):
     shape: list[int]
     data: str
 
+    @classmethod
+    def packed(cls, matrix: F2) -> PackedMatrix:
+        """Pack the lower triangle of a symmetric matrix."""
+        lower = matrix[np.tril_indices(len(matrix))]
+        return cls(encoding=ENCODING, shape=list(matrix.shape), data=base64.b64encode(lower.astype("<f8").tobytes()).decode())
+
+    def unpacked(self) -> F2:
+        """Return the whole matrix."""
+        n = self.shape[0]
+        out = np.zeros((n, n))
+        out[np.tril_indices(n)] = np.frombuffer(base64.b64decode(self.data), dtype="<f8")
+        return out + np.tril(out, -1).T
+
 
 class StoredPrediction(FileObject):
     """Coefficients with their full uncertainty, from which predictions can be repeated.
+
+    Deviation at points = field @ coefficients, covariance = field @ covariance @ field^T, where field holds the deviation per unit of each
+    term (`abbe.models.geometry.volume.unit_deviation`, with the machine's tool and the requested frame).
 
     ``terms``: motion, Legendre order, axis (0 to 2) and component (0 to 2 translation, 3 to 5 rotation) of each; ``coefficients`` in mm or
     rad; ``scatter_mm``: standard deviation that a single approach of a point adds per component.
@@ -211,6 +245,10 @@ class StoredPrediction(FileObject):
     coefficients: list[float]
     covariance: PackedMatrix
     scatter_mm: float
+
+    def unpacked(self) -> tuple[tuple[Term, ...], F1, F2]:
+        """Return the terms, their coefficients and the covariance of these."""
+        return tuple(Term(*t) for t in self.terms), np.asarray(self.coefficients, dtype=np.float64), self.covariance.unpacked()
 
 
 class TableRow(FileObject):

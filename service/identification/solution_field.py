@@ -15,7 +15,6 @@ from abbe.models.uncertainty.known_field import KnownField, field_map
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotObservable, Unusable
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from abbe.service.verification.deviations import standard_uncertainty_mm
@@ -95,7 +94,7 @@ def stored_field(store: Store, record: SolutionRecord) -> StoredField:
     solution = stored_solution(record.doc, record.id)
     if solution.prediction is None:
         raise Unusable(f"solution {record.id} has no covariance: an older version of Abbe stored it", "solve again")
-    terms, coefficients, covariance = stored_prediction(solution.prediction)
+    terms, coefficients, covariance = solution.prediction.unpacked()
     machine = machine_from_doc(store.machines.get(store.campaigns.find(record.campaign_id).machine_id).doc)
     motions = solution.motions
     statuses = {name: m.status for name, m in motions.items()}

@@ -41,22 +41,23 @@ from abbe.service.domain.solution_file import (
     NoiseFound,
     ObservabilityNumber,
     OutlierFound,
+    PackedMatrix,
     ParameterValue,
     Rank,
     ResidualTestResult,
     RunResult,
     SolutionFile,
+    StoredPrediction,
     Uncertainty,
     VerdictValue,
     Versions,
     WithoutScale,
     WorstPoint,
+    distinct,
 )
 from abbe.service.identification.artefact_answer import artefact_lines
 from abbe.service.identification.removal import with_unknown_table
 from abbe.service.identification.solve import HELIX_NOTE, STEP_NOTE, Solved
-from abbe.service.identification.stored_prediction import prediction_of
-from abbe.service.tables.measured_with import distinct
 
 VERDICTS = ("mostly assumption", "usable with care", "good")
 ENOUGH, HALF = 0.8, 0.5
@@ -279,7 +280,7 @@ def solution_of(solved: Solved | Assessment) -> SolutionFile:
         residual_tests=_residual_tests(joint),
         flags=[f.line for f in found.solved.flags],
         uncertainty=_uncertainty(found),
-        prediction=prediction_of(found.sources),
+        prediction=_prediction(found.sources),
         ten_parameter_helix={
             label: {n: MeanValue(value=h.estimate.value(n), u=h.estimate.u(n)) for n in h.estimate.names}
             for label, h in found.solved.helices.items()
@@ -320,6 +321,21 @@ def _inputs(found: Assessment, model: str) -> Inputs:
         machine=machine,
         runs=found.solved.digests,
         tables=distinct(found.solved.tables.values()),
+    )
+
+
+def _prediction(sources: ErrorSources) -> StoredPrediction:
+    """Return the terms, coefficients in mm and rad, and their covariance from all sources."""
+    total = np.zeros((len(sources.terms), len(sources.terms)))
+    for s in sources.sources:
+        total += s.factor @ s.factor.T
+        if s.subtracted is not None:
+            total -= s.subtracted @ s.subtracted.T
+    return StoredPrediction(
+        terms=[(t.motion, t.order, t.axis, t.component) for t in sources.terms],
+        coefficients=[float(v) for v in sources.coefficients],
+        covariance=PackedMatrix.packed(total),
+        scatter_mm=float(np.sqrt(sum(s.scatter_mm**2 for s in sources.sources))),
     )
 
 

@@ -12,9 +12,8 @@ from dataclasses import replace
 import structlog
 
 from abbe.models.compensation.tables import Predicted
-from abbe.service.campaigns.device_checks import check_devices
+from abbe.service.campaigns.device_checks import check_devices, needed_by
 from abbe.service.campaigns.measure import MeasureOptions, artefacts_of, measure, start_campaign
-from abbe.service.campaigns.plausibility import certificates, needed_by
 from abbe.service.campaigns.resume import resume as resume_campaign
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.recover import recovered_session
@@ -27,7 +26,7 @@ from abbe.service.jobs.investigate import REFUSALS, InvestigationContext, invest
 from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import RecipeSource
-from abbe.service.site import check_certificates
+from abbe.service.site import certificates, check_certificates
 from abbe.service.tables.nine_tables import read_base
 from abbe.service.verification.alarm_states import Alarm, Note
 

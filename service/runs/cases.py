@@ -16,7 +16,7 @@ from abbe.service.domain.machine import Role
 from abbe.service.domain.run import BarSetup, LaserSetup, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL
 from abbe.service.errors import MeasurementFault
-from abbe.service.runs.observations import with_reversals
+from abbe.service.runs.observations import with_earliest_mounting, with_reversals
 
 RESOLUTION_MM = {"bar": 1e-4, "laser": 1e-5}
 AXES = "XYZ"
@@ -44,20 +44,6 @@ def case_of(campaign: dict[str, Any], machine: Machine, runs: list[Run]) -> Case
     includes = (campaign.get("current_model") or {}).get("includes", ASSUMED_MODEL)
     found = tuple(_run(run, machine, vertical, dead) for run in with_earliest_mounting(runs) if not run.is_artefact)
     return Case(str(campaign["campaign"]), machine, frozenset(includes), found, resolution)
-
-
-def with_earliest_mounting(runs: list[Run]) -> list[Run]:
-    """Give all runs of a set-up its earliest ``t_set_s``: the set-up was mounted once, and later values are only starts of runs.
-
-    Call this with all runs of a campaign before leaving any out, because an omitted run may hold the only mounting time.
-    """
-    earliest: dict[str, float] = {}
-    for run in runs:
-        setup = run.setup
-        if setup.t_set_s is not None:
-            earliest[setup.setup_id] = min(setup.t_set_s, earliest.get(setup.setup_id, np.inf))
-    times = [earliest.get(run.setup.setup_id) for run in runs]
-    return [run if t is None else run.mounted(t) for run, t in zip(runs, times, strict=True)]
 
 
 def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> CaseRun:

@@ -154,3 +154,17 @@ def _since_first(deviation_mm: F1, *, first_valid: bool) -> F1:
 def bar_noise_mm(run: Run) -> float:
     """Return the standard deviation of one valid ball-bar reading, mm (`abbe.models.solvers.observations.reading_noise_mm`)."""
     return reading_noise_mm(run.columns.readings_mm[run.columns.valid])
+
+
+def with_earliest_mounting(runs: list[Run]) -> list[Run]:
+    """Give all runs of a set-up its earliest ``t_set_s``: the set-up was mounted once, and later values are only starts of runs.
+
+    Call this with all runs of a campaign before leaving any out, because an omitted run may hold the only mounting time.
+    """
+    earliest: dict[str, float] = {}
+    for run in runs:
+        setup = run.setup
+        if setup.t_set_s is not None:
+            earliest[setup.setup_id] = min(setup.t_set_s, earliest.get(setup.setup_id, np.inf))
+    times = [earliest.get(run.setup.setup_id) for run in runs]
+    return [run if t is None else run.mounted(t) for run, t in zip(runs, times, strict=True)]

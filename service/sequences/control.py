@@ -1,4 +1,4 @@
-"""Reasons to stop motion: requests of people (`Control`), and conditions in the status of the machine (interlocks).
+"""Reasons to stop motion: requests of people (`Control`), conditions in the status of the machine (interlocks), another table or boot.
 
 A `Control` pauses, resumes, stops and aborts a measurement, and reports its state. Call it in the event loop of the measurement; from a
 signal handler or another thread use ``loop.call_soon_threadsafe``.
@@ -22,6 +22,7 @@ from abbe.service.errors import (
     DrivesOff,
     EstopPressed,
     Interlock,
+    PreconditionsChanged,
     ProgramRuns,
     RemoteLost,
     SpindleTurns,
@@ -392,3 +393,25 @@ def _ended(task: asyncio.Task[T], cancelled: asyncio.CancelledError | None) -> T
     for note in notes:
         ended.add_note(note)
     raise ended
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedTable:
+    """Boot id of the controller and CRC of the active table when the campaign began."""
+
+    boot_id: int
+    table_crc: int
+
+
+def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> None:
+    """Raise PreconditionsChanged if the controller was restarted or another table is active."""
+    if boot_id != expected.boot_id:
+        raise PreconditionsChanged(
+            f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
+            "its clock started again: measure a new campaign; the complete runs of this campaign are kept",
+        )
+    if table_crc != expected.table_crc:
+        raise PreconditionsChanged(
+            f"another compensation table is active (CRC {table_crc:08X} instead of {expected.table_crc:08X})",
+            "make the old table active again, or measure a new campaign",
+        )

@@ -15,7 +15,7 @@ from abbe.service.domain.measured import LaserRecord, TouchRecord
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
 from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
-from abbe.service.sequences.control import AT_WORK, PAUSED, Control, Watching, check_interlocks, check_ours
+from abbe.service.sequences.control import AT_WORK, PAUSED, Control, ExpectedTable, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
 from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
 from abbe.service.sequences.probing import FeatureTouch, check_same, guarded_move, need_probe
@@ -38,7 +38,7 @@ from abbe.service.sequences.steps import (
     ZeroLaser,
     references_of,
 )
-from abbe.service.sequences.waiting import ExpectedTable, paused
+from abbe.service.sequences.waiting import paused
 from abbe.service.sequences.watch import NOTHING, Watch, watched
 
 # A ball-bar reading at standstill: the mean of a few samples that the box began after the axes had settled.

@@ -7,32 +7,25 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import Awaitable
-from dataclasses import dataclass
 
 from abbe.drivers.api import ControllerStatus, signal_is_there
 from abbe.drivers.errors import DriverError
 from abbe.service.devices.session import Session
-from abbe.service.errors import BeamLost, DoorOpen, Interlock, PreconditionsChanged
+from abbe.service.errors import BeamLost, DoorOpen, Interlock
 from abbe.service.sequences.control import (
     CAN_CLEAR,
     Control,
+    ExpectedTable,
     State,
     Suspending,
     Watching,
     air_trouble,
     beam_trouble,
+    check_expected,
     check_interlocks,
     person_may_be_inside,
 )
 from abbe.service.sequences.journal import GOES_ON, WAITS, Journal
-
-
-@dataclass(frozen=True, slots=True)
-class ExpectedTable:
-    """Boot id of the controller and CRC of the active table when the campaign began."""
-
-    boot_id: int
-    table_crc: int
 
 
 async def check_preconditions(session: Session, expected: ExpectedTable | None, watching: Watching, *, beam: bool) -> ControllerStatus:
@@ -56,20 +49,6 @@ async def check_preconditions(session: Session, expected: ExpectedTable | None, 
         if trouble is not None:
             raise trouble
     return status
-
-
-def check_expected(expected: ExpectedTable, boot_id: int, table_crc: int) -> None:
-    """Raise PreconditionsChanged if the controller was restarted or another table is active."""
-    if boot_id != expected.boot_id:
-        raise PreconditionsChanged(
-            f"the controller was restarted since this campaign began (boot id {boot_id:#x} instead of {expected.boot_id:#x})",
-            "its clock started again: measure a new campaign; the complete runs of this campaign are kept",
-        )
-    if table_crc != expected.table_crc:
-        raise PreconditionsChanged(
-            f"another compensation table is active (CRC {table_crc:08X} instead of {expected.table_crc:08X})",
-            "make the old table active again, or measure a new campaign",
-        )
 
 
 LOOK_S = 0.1

@@ -22,7 +22,7 @@ from sqlalchemy.pool import StaticPool
 
 from abbe.service.errors import StoreError
 from abbe.service.secrets import mask_secrets
-from abbe.service.storage.journal_mode import wal_is_safe
+from abbe.service.storage import wal_is_safe
 
 if TYPE_CHECKING:
     from alembic.config import Config
@@ -69,6 +69,7 @@ BUSY_TIMEOUT_MS = 5000
 JOURNAL_LIMIT_BYTES = 64 * 2**20
 READ_ONLY_OPTION = "abbe_reads_only"
 _SQLITE_MAGIC = b"SQLite format 3\x00"
+_JOURNAL_MODE = "WAL" if wal_is_safe() else "PERSIST"
 
 
 def resolve_url(url: str, base: Path | None = None) -> str:
@@ -205,7 +206,7 @@ def _set_pragmas(connection: sqlite3.Connection, _record: object) -> None:
     cursor = connection.cursor()
     try:
         cursor.execute(f"PRAGMA busy_timeout={BUSY_TIMEOUT_MS}")
-        cursor.execute(f"PRAGMA journal_mode={'WAL' if wal_is_safe() else 'PERSIST'}")
+        cursor.execute(f"PRAGMA journal_mode={_JOURNAL_MODE}")
         cursor.execute("PRAGMA synchronous=FULL")
         cursor.execute("PRAGMA foreign_keys=ON")
         cursor.execute("PRAGMA trusted_schema=OFF")

@@ -6,10 +6,8 @@ the old correction and make the machine worse. `abbe correct` adds the old and t
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-
 from abbe.service.domain.document import Doc
-from abbe.service.domain.solution_file import TableInForce
+from abbe.service.domain.solution_file import TableInForce, distinct
 from abbe.service.errors import FormatRefused
 from abbe.service.runs.exchange import Images
 from abbe.service.storage.store import Store
@@ -19,15 +17,6 @@ KIND_AT, NO_CORRECTION = slice(4, 6), 0
 """Place of the table's kind in an image (docs/protocols/cnc.md, word 2), and the kind that corrects nothing."""
 REMEDY = "measure again without a table in force; or, if the control has Abbe's register map, add the tables with `abbe correct`"
 CONFIRM_REMEDY = "if no correction was in force, confirm with --without-table"
-
-
-def distinct(tables: Iterable[Doc]) -> list[TableInForce]:
-    """Return the tables of runs, sorted by CRC. ``acting``: whether the table corrects, as the controller states; None in older runs."""
-    acting: dict[int, bool | None] = {}
-    for table in tables:
-        crc, acts = int(table["crc"]), table.get("acting")
-        acting[crc] = acting.get(crc) if acts is None else bool(acts)
-    return [TableInForce(crc=crc) if (acts := acting[crc]) is None else TableInForce(crc=crc, acting=acts) for crc in sorted(acting)]
 
 
 def tables_of(doc: Doc) -> list[TableInForce]:

@@ -10,8 +10,8 @@ from pathlib import Path
 import pytest
 
 from abbe.drivers.errors import DriverError, Refused, ReplyTimeout, SettingsChanged, WrongDevice
+from abbe.service.campaigns.device_checks import needed_by
 from abbe.service.campaigns.measure import measure
-from abbe.service.campaigns.plausibility import needed_by
 from abbe.service.compensation.correct import correct
 from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.errors import ConfigError

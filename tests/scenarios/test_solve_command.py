@@ -13,7 +13,6 @@ from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.domain.solution_file import SolutionFile, StoredPrediction
 from abbe.service.identification import solve_report
 from abbe.service.identification.solve import solve_runs
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.runs.exchange import import_folder
 from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
@@ -110,7 +109,7 @@ def test_json_keeps_to_its_schema_and_holds_the_truth(command, folder):
     worst = doc["uncertainty"]["worst_point"]
     assert worst["expanded_vector_um"] >= max(worst["expanded_um"])
     machine = machine_from_doc(doc["machine"])
-    terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
+    terms, coefficients, covariance = StoredPrediction.read(doc["prediction"]).unpacked()
     field_at = unit_deviation(machine, terms, np.array([worst["at_mm"]]), None, volume_frame(machine))[0]
     assert field_at @ coefficients * 1e3 == pytest.approx(worst["deviation_um"], abs=1e-6)
     assert np.sqrt(np.diag(field_at @ covariance @ field_at.T)) * 1e3 == pytest.approx(worst["u_um"], rel=0.01)

@@ -27,7 +27,7 @@ def version(as_json: JsonOption = False) -> None:
     import sqlite3
     from importlib import metadata
 
-    from abbe.service.storage.journal_mode import wal_is_safe
+    from abbe.service.storage import wal_is_safe
 
     log = "write-ahead log" if wal_is_safe() else "no write-ahead log: this SQLite has the WAL-reset bug"
     doc = {"abbe": metadata.version("abbe"), "python": platform.python_version(), "sqlite": sqlite3.sqlite_version, "log": log}

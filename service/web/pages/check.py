@@ -22,9 +22,8 @@ from abbe.service.rendering.model import PolarTrace
 from abbe.service.rendering.plots.curves import overlay_plot
 from abbe.service.rendering.plots.gap import thinned
 from abbe.service.rendering.plots.polar import polar_plot
-from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
-from abbe.service.runs.observations import run_data
+from abbe.service.runs.observations import run_data, with_earliest_mounting
 from abbe.service.users.roles import Permission
 from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, curve, incomparable_reason
 from abbe.service.web import language

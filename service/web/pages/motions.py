@@ -19,9 +19,8 @@ from abbe.service.rendering.model import MotionCurve
 from abbe.service.rendering.numbers import COVERAGE, plain, with_uncertainty
 from abbe.service.rendering.plots.tables import motion_bands
 from abbe.service.report.solution_sections import curves_of
-from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
-from abbe.service.runs.observations import run_data
+from abbe.service.runs.observations import run_data, with_earliest_mounting
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 from abbe.service.web.pages.results import Ranked, ranking

@@ -16,7 +16,6 @@ from abbe.service.domain.machine import Rules
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction, stored_solution
 from abbe.service.errors import AbbeError
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.results import DiscoveryDetail, discovery
 from abbe.service.rendering.document import Document, Sign
@@ -70,7 +69,7 @@ class Ranked:
 
 def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], machine: Machine) -> list[Ranked]:
     """Every motion of a stored solution, largest contribution first; ``machine``: nominal geometry of the measured machine."""
-    terms, coefficients, covariance = stored_prediction(prediction)
+    terms, coefficients, covariance = prediction.unpacked()
     points = volume_grid(machine.stroke_mm, NODES)
     design = unit_deviation(machine, terms, points, None, volume_frame(machine))
     out = []

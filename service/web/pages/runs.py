@@ -21,9 +21,8 @@ from abbe.service.rendering.numbers import COVERAGE, finite, plain
 from abbe.service.rendering.plots.curves import difference_plot, overlay_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.report.report_measured import Measured, run_report
-from abbe.service.runs.cases import with_earliest_mounting
 from abbe.service.runs.columns import load_run
-from abbe.service.runs.observations import run_data
+from abbe.service.runs.observations import run_data, with_earliest_mounting
 from abbe.service.site import Site, machine_from_doc
 from abbe.service.storage.store import Store
 from abbe.service.verification.compare_runs import (

@@ -14,7 +14,7 @@ import pytest
 
 from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.service import cli
-from abbe.service.storage.journal_mode import wal_is_safe
+from abbe.service.storage import wal_is_safe
 from abbe.service.storage.store import Store
 from tests.patience import within
 
@@ -251,7 +251,7 @@ def test_sim_forwards_arguments_and_signals(tmp_path: Path, number: signal.Signa
 
 def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsys):
     """Notes carry what safety rests on: a bar that still hangs in, a table that may be in force."""
-    from abbe.service.cli import app as module
+    from abbe.service import cli
     from abbe.service.errors import DoorOpen
 
     def fails(**_: object) -> None:
@@ -259,7 +259,7 @@ def test_what_an_error_was_told_on_its_way_is_printed_with_it(monkeypatch, capsy
         error.add_note("cup and bar may still be mounted: take them out before anything moves")
         raise error
 
-    monkeypatch.setattr(module, "named_by", lambda words: fails)
+    monkeypatch.setattr(cli, "named_by", lambda app, words: fails)
     assert cli.run(["check-config", "-m", "x"]) == 2
     assert capsys.readouterr().err == (
         "error ILK-003: the door is open - close it; cup and bar may still be mounted: take them out before anything moves\n"

@@ -12,10 +12,9 @@ import pytest
 from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.service.cli import run
 from abbe.service.domain.push_entry import PushState
-from abbe.service.domain.solution_file import TableInForce
+from abbe.service.domain.solution_file import TableInForce, distinct
 from abbe.service.push.journal import GENESIS, follow
 from abbe.service.storage.store import Store
-from abbe.service.tables.measured_with import distinct
 from tests.service.formats.test_choice import _document, _known
 
 ACTING = encode(TableImage(1, 5, 100, (0.0, 0.0, 0.0), (100.0, 100.0, 100.0), (2, 2, 2), tuple(range(18))))

@@ -19,8 +19,8 @@ import pytest
 from abbe.service.domain.measured import ImportedRun, process_start, this_process
 from abbe.service.errors import StoreError
 from abbe.service.secrets import mask_secrets
+from abbe.service.storage import wal_is_safe
 from abbe.service.storage.engine import resolve_url
-from abbe.service.storage.journal_mode import wal_is_safe
 from abbe.service.storage.store import Store
 
 

@@ -12,7 +12,6 @@ from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.service.domain.document import Doc
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from abbe.service.web.pages.results import NODES, Ranked, ranking
 from tests.pages_world import solved_campaign
@@ -36,7 +35,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> tuple[Machine, dict[str, 
 
 def test_the_contribution_is_the_rms_of_the_deviation_without_rigid_motion(known) -> None:
     machine, doc, ranked = known
-    terms, coefficients, _ = stored_prediction(StoredPrediction.read(doc["prediction"]))
+    terms, coefficients, _ = StoredPrediction.read(doc["prediction"]).unpacked()
     points = volume_grid(machine.stroke_mm, NODES)
     reference = volume_grid(machine.stroke_mm, NODES)  # the frame of the product is fitted to another, coarser grid
     found = {r.name: r.value_um for r in ranked}
@@ -49,7 +48,7 @@ def test_the_contribution_is_the_rms_of_the_deviation_without_rigid_motion(known
 
 def test_the_uncertainty_is_the_scatter_of_solutions_drawn_at_random(known) -> None:
     machine, doc, ranked = known
-    terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
+    terms, coefficients, covariance = StoredPrediction.read(doc["prediction"]).unpacked()
     points = volume_grid(machine.stroke_mm, NODES)
     full = design(machine, terms, points)
     rng = np.random.default_rng(11)

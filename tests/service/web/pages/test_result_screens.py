@@ -15,7 +15,6 @@ from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.models.verification import U_REPEAT_MM
 from abbe.service.domain.machine import Rules
 from abbe.service.domain.solution_file import StoredPrediction
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.runs.observations import run_data
 from abbe.service.site import machine_from_doc
 from abbe.service.verification.compare_runs import LoadedRun, RunDifference, curve, difference, remarks
@@ -48,7 +47,7 @@ def test_the_interface_answers_the_map_with_the_whole_covariance(running: Served
     with as_user(running, "vera") as client:
         told = client.get(f"/api/v1/solutions/{number}/field", params={"nodes": 3}).json()
     doc = running.store.solutions.get(number).doc
-    terms, coefficients, covariance = stored_prediction(StoredPrediction.read(doc["prediction"]))
+    terms, coefficients, covariance = StoredPrediction.read(doc["prediction"]).unpacked()
     machine = machine_from_doc(running.store.machines.all()[-1].doc | doc["machine"])
     points = np.array([[x, y, z] for x in told["x_mm"] for y in told["y_mm"] for z in told["z_mm"]])
     d = unit_deviation(machine, terms, points, None, volume_frame(machine))

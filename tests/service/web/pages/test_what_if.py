@@ -29,7 +29,6 @@ from abbe.models.uncertainty.what_if import (
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
 from abbe.service.domain.solution_file import StoredPrediction
-from abbe.service.identification.stored_prediction import stored_prediction
 from abbe.service.site import machine_from_doc
 from tests.pages_world import solved_campaign
 
@@ -39,7 +38,7 @@ def known(tmp_path_factory: pytest.TempPathFactory) -> KnownField:
     site, _, solved, doc = solved_campaign(tmp_path_factory, "m")
     del solved
     machine = machine_from_doc(json.loads(json.dumps(site.doc)))
-    return KnownField(machine, *stored_prediction(StoredPrediction.read(doc["prediction"])), doc["prediction"]["scatter_mm"])
+    return KnownField(machine, *StoredPrediction.read(doc["prediction"]).unpacked(), doc["prediction"]["scatter_mm"])
 
 
 def certain(known: KnownField) -> KnownField:
