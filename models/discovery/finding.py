@@ -103,8 +103,9 @@ def as_plain(problem: WhitenedProblem, pick: Pick, *, offset: bool = True) -> F2
     """Return the matrix that turns coefficients of a pick (forms included) into coefficients of the plain effect with the nearest signal.
 
     "Nearest" is by least squares. Shape: (columns of the effect, columns of effect and forms). Only forms that carry part of the effect's
-    size count: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second harmonic
-    or wind-up, are no part of the strength. ``offset``: fit the start value of a sensor, too, so that it does not change the strength.
+    size are included: an amplitude that changes along the axis, other thermal courses, a followed sensor. Other forms, such as a second
+    harmonic or wind-up, do not change the strength. ``offset``: fit the start value of a sensor, too, so that it does not change the
+    strength.
     """
     raw = pick.raw(problem)
     k = problem.raw(pick.effect.signal, pick.key, pick.values).shape[1]
@@ -235,7 +236,7 @@ def _judge(
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
-        rejected += [(e.label, f"evidence {e.evidence:.0f}, less than the structures without a name have: not named") for e in effects]
+        rejected += [(e.label, f"evidence {e.evidence:.0f}, below that of the structures without a name: not named") for e in effects]
     for i, j in companion.items():
         share_text = f"evidence {found[i].score / 2.0:.0f}: possibly only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))

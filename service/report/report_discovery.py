@@ -226,7 +226,10 @@ def _pictures(found: _Found) -> list[Block]:
         out.append(PictureBlock(f"{text}. Both panels have one scale; band: ± 2 standard deviations of the noise.", traces, "wide"))
     places = [place_plot(p, key=f"place-{i}") for i, (a, b) in enumerate(((0, 1), (0, 2))) if (p := _place(found, a, b)) is not None]
     if places:
-        text = "Gap before, divided by the noise of one reading, for each cell of the measured area. A ring marks the located area."
+        text = (
+            "Gap of the present model, divided by the noise of one reading, for each cell of the measured area."
+            " A ring marks the located area."
+        )
         out.append(PictureBlock(text, places))
     return out
 

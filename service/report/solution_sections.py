@@ -99,8 +99,8 @@ def _motions(found: Assessment) -> list[Block]:
 
 def _observability(found: Assessment, shares: Sequence[MotionShare]) -> list[Block]:
     caption = (
-        "Filled: these runs show the motion by itself. Outline only: part of the motion looks like another error in every reading, even if"
-        " its bar in the picture is long; do not put it into a compensation table of its own."
+        "Filled: these runs show the motion by itself. Outline only: in every reading, part of the motion looks like another error, however"
+        " long the bar; do not put it into a compensation table of its own."
     )
     out: list[Block] = [layout_line(found.observability.number), PictureBlock(caption, [share_plot(shares)])]
     if found.observability.advice:
