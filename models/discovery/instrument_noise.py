@@ -34,7 +34,7 @@ LOW = 1.2
 """Relative bias of the noise found by `fine`, in units of 1/sqrt(n) for n readings: even without effects, the run at the share `QUIET` has
 less noise than the average run. Product of 0.67 (quartile), 1.17 (median) and 1.5 (differences share readings)."""
 LONE = 7.0
-"""A reading farther from its neighbours than this many standard deviations does not count."""
+"""A reading farther from its neighbours than this many standard deviations is left out."""
 
 
 @dataclass(frozen=True)

@@ -51,7 +51,7 @@ class Floor:
 def floors(problem: WhitenedProblem) -> dict[str, Floor]:
     """Return the noise of each instrument, from repeats or from differences of neighbouring readings, the smaller of both.
 
-    Residuals also contain model errors, so they count only if repeats and differences are not clearly smaller. Neither repeats nor
+    Residuals also contain model errors, so they are used only if repeats and differences are not clearly smaller. Neither repeats nor
     differences contain an effect, so the closed share of a gap does not depend on the effects found.
     """
     left = problem.projection.residual * problem.sd_mm()

@@ -24,7 +24,7 @@ TAUS = (0.15, 0.3, 0.6, 1.2)
 TRIALS = 2000
 MEMORIES = np.linspace(0.0, 0.96, 25)
 LEAST = 3
-"""Repeats of a position count only if it was visited from one side at least this often."""
+"""Repeats of a position are used only if it was visited from one side at least this often."""
 
 
 @dataclass(frozen=True)

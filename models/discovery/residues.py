@@ -75,7 +75,7 @@ def residues(
     Parameters
     ----------
     effects : all named effects. scatter : labels of those found in the variance.
-    without : evidence of one effect with the other taken out (`shared`). It counts if it is larger: the part that both explain belongs to
+    without : evidence of one effect with the other taken out (`shared`). It is used if it is larger: the part that both explain belongs to
         the stronger one. If neither is clearly the stronger one (`CLEARLY_WEAKER`), none is a residue (`ties`).
 
     Returns

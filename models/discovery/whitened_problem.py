@@ -132,7 +132,7 @@ class WhitenedProblem:
     ----------
     paths : paths of the runs, with the bar directions of the fitted machine (`Baseline.along`).
     gap : array, shape (n,): reading minus the fitted simulation, mm.
-    use : array, shape (n,): 1, or 0 for readings that do not count (flagged, single laser outliers, or excess variance).
+    use : array, shape (n,): 1, or 0 for readings that are left out (flagged, single laser outliers, or excess variance).
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.
@@ -168,7 +168,7 @@ class WhitenedProblem:
         return tuple(p.kind for p in self.paths)
 
     def white(self, columns: F2) -> F2:
-        """Whiten columns (n, k), mm, to unit noise; readings that do not count become zero."""
+        """Whiten columns (n, k), mm, to unit noise; readings that are left out become zero."""
         out = unscaled(columns * self.use[:, None], self.lengths, self.kinds, self.colours)
         out /= self.sd_mm()[:, None]
         return out
@@ -301,7 +301,7 @@ def with_projection(problem: WhitenedProblem) -> WhitenedProblem:
 def with_estimated_noise(problem: WhitenedProblem, found: Sequence[tuple[F2, F1]], *, memory: bool = False) -> WhitenedProblem:
     """Estimate the noise of a problem again, with the effects ``found`` (raw columns, prior sd) fitted, and exclude single outliers.
 
-    ``memory``: also estimate the autocorrelation of the noise (`remembered`); only after a search, or effects would count as noise.
+    ``memory``: also estimate the autocorrelation of the noise (`remembered`); only after a search, or effects would be taken as noise.
     """
     for k in range(ROUNDS):
         problem = with_projection(problem)

@@ -25,7 +25,7 @@ COVERAGE = 2.0
 NATS = 5.0
 """Least evidence, nats, for a field in part or machine."""
 LEAST_MM = 0.3e-3
-"""A field below this size counts as none, however certain it is."""
+"""A field below this size is taken as zero, however certain it is."""
 
 Verdict = Literal["with the part", "with the machine", "with both", "unknown", "none"]
 

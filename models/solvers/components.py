@@ -328,14 +328,14 @@ def _fit_length(sums: InformationSums, model: SizeModel, start: Components) -> t
 
 
 ROUGH_CAUTION = 0.2
-"""Share of the widening by `cautious` that counts in U of a rough machine. Its rough parts absorb what the shapes of the smooth prior do
-not follow; with the whole widening U is 20 to 30 % too wide (docs/explanation/coverage.md). The map keeps the whole widening at no cost."""
+"""Share of the widening by `cautious` that U of a rough machine includes. Its rough parts absorb what the shapes of the smooth prior do
+not follow; with the whole widening U is 20 to 30 % too wide (docs/explanation/coverage.md). The map itself uses the whole widening."""
 
 
 def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> tuple[SizeModel, Components]:
     """Return a prior of the error motions that is wider than the most probable one, so that uncertainties are not too small.
 
-    The prior is wider in two ways, neither of which matters with many readings. ``share``: share of the first that counts.
+    The prior is wider in two ways, neither of which matters with many readings. ``share``: share of the first way that is applied.
 
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
       that the readings hardly separate, the most probable sizes are too small. Without information the limit is the documented variance; on

@@ -282,7 +282,7 @@ def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) 
 
 
 def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:
-    """Score for further terms, whose variance the fit takes as zero, in standard deviations of the score if there are no such terms.
+    """Score for further terms, whose variance the fit takes as zero, in standard deviations that the score has without such terms.
 
     The score is the derivative of the log evidence by the variance of ``terms`` (prior: `size_model`), divided by the root of its expected
     information (Rao's score test). It is positive if residuals are more alike than noise at readings where these terms are alike.

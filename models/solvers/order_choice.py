@@ -24,7 +24,8 @@ FOLDS = 8
 RIGID6 = 0
 """Level of the model with three scales and three squareness errors only."""
 END, CORNER = 0.15, 0.3
-"""`END`: part of a measured range that counts as the end of the stroke. `CORNER`: part of each of the three ranges that makes a corner."""
+"""`END`: part of a measured range that is taken as the end of the stroke. `CORNER`: part of each of the three ranges that makes a
+corner."""
 FEWEST = 6
 """Least number of readings of a region."""
 

@@ -1,8 +1,8 @@
 """Runs of a campaign that contradict the others: wrong unit, wrong sign, swapped axes, another machine.
 
 All runs form one linear model with wide priors. For every run and every possible mistake, the evidence of the whole campaign is computed
-with this mistake corrected, and with this run unrelated to the others. The best hypothesis counts only if its log evidence is higher by
-`STRONG`. Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong").
+with this mistake corrected, and with this run unrelated to the others. The best hypothesis is accepted only if its log evidence is higher
+by `STRONG`. Source: marginal likelihood of a linear model with normal priors (Bayes factors; Kass and Raftery 1995 call 5 "very strong").
 """
 
 from __future__ import annotations

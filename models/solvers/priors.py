@@ -78,7 +78,7 @@ class Priors:
 def bar_length_sd(u_length_mm: float | None, calibrated: bool | None, priors: Priors) -> float:
     """Prior standard deviation of a bar's length, mm, from what its run states (docs/schemas/run.schema.json).
 
-    The stated ``u_length_mm`` counts, except for a bar that is stated as uncalibrated. Such a bar, or one about which the run states
+    The stated ``u_length_mm`` is used, except for a bar that is stated as uncalibrated. Such a bar, or one about which the run states
     nothing, gets at least ``bar_unknown_mm``, so that its length does not fix the machine's scales.
     """
     if calibrated is False or (calibrated is None and u_length_mm is None):

@@ -30,7 +30,7 @@ CHANCE = 30.0
 """Gain that the best of all periods reaches by chance."""
 MOST_PERIODS = 4
 GROSS = 5.0
-"""A residual beyond this many medians of its run is no part of a wave."""
+"""A residual beyond this many medians of its run is not part of a wave."""
 POINTS_PER_PERIOD = 4
 """A table follows a period with this many points in each."""
 

@@ -26,7 +26,7 @@ POINTS_OF_DATA = ("feature", "deviation_x_mm", "deviation_y_mm", "deviation_z_mm
 
 
 def run_digest(run: Run) -> str:
-    """Return the SHA-256 of test, set-up and the columns that a solution uses; label and campaign do not count."""
+    """Return the SHA-256 of test, set-up and the columns that a solution uses; label and campaign are left out."""
     out = hashlib.sha256(json.dumps([run.test, run.setup.document], sort_keys=True).encode())
     columns = run.columns.by_name()
     for name in SETUP_OF_DATA + (POINTS_OF_DATA if run.columns.of_artefact else ()):
@@ -73,7 +73,7 @@ def _bytes(values: NDArray[Any]) -> bytes:
 
 
 def code_digest(function: Callable[..., Any]) -> str:
-    """Return the SHA-256 of a function's file, so that an edited plug-in counts as another plug-in; without a file, of its module name."""
+    """Return the SHA-256 of a function's file, so that an edited plug-in is another plug-in; without a file, of its module name."""
     inner = getattr(function, "func", function)  # functools.partial
     name = str(getattr(inner, "__module__", type(inner).__module__))
     file = getattr(sys.modules.get(name), "__file__", None)
@@ -81,7 +81,7 @@ def code_digest(function: Callable[..., Any]) -> str:
 
 
 def machine_digest(machine: Machine) -> str:
-    """Return the SHA-256 of the geometry: chain, strokes, pivots, tool. The machine's name does not count."""
+    """Return the SHA-256 of the geometry: chain, strokes, pivots, tool. The machine's name is left out."""
     out = hashlib.sha256(machine.chain.encode())
     for values in (machine.stroke_mm, machine.pivots_mm, machine.tool_mm):
         out.update((np.asarray(values, dtype="<f8") + 0.0).tobytes())  # + 0.0: minus zero is zero

@@ -61,7 +61,7 @@ class BarPlaces:
         self.centre_mm, self.radius_mm = hemisphere(self.site.machine, (0.5, 0.5, 0.35), 0.6)
 
     async def read(self, what: str) -> PlaceReadings:
-        """Read all positions with the table in force, as a campaign of its own.
+        """Read all positions with the table in force, as a separate campaign.
 
         Raises
         ------

@@ -157,7 +157,7 @@ def in_mounting(item: Item, mounting: int) -> Item:
 
 
 def mounted_anew(item: Item, mounting: int) -> Item:
-    """Restart a test from its beginning, with a mounting of its own."""
+    """Restart a test from its beginning, with a new mounting."""
     whole = remounted(item.test, item.first, mounting)
     return replace(
         item, whole=whole, left=whole, mounting=mounting, offset=0, resume_trail=ResumeTrail(), hand=None, before=None, remainder=None

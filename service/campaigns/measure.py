@@ -52,7 +52,7 @@ WAITING = (State.PAUSED, State.SUSPENDED)
 class ProgressReporter:
     """Progress of a job in planned machine seconds. The ETA follows first from the dry run, then from the pace so far.
 
-    Time spent waiting for a person (``waited_s``) does not count.
+    Time spent waiting for a person (``waited_s``) is left out.
     """
 
     stage: str

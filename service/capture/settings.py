@@ -95,7 +95,7 @@ def free_name(path: Path, suffix: str) -> Path:
 
 
 def set_aside(path: Path, suffix: str) -> Path:
-    """Rename a file so that it no longer counts as a segment; overwrites nothing. Raises OSError."""
+    """Rename a file so that it is no longer taken for a segment; overwrites nothing. Raises OSError."""
     name = free_name(path, suffix)
     path.rename(name)
     return name

@@ -34,7 +34,7 @@ from abbe.service.tables.nine_tables import Base, check_test_step, read_base
 KIND = "sign-proof"
 STEP_MM, FIRST_MM = 0.010, 0.0005
 HARMLESS = 10.0
-"""The first step must not move the tool by more than this multiple of itself."""
+"""Largest motion of the tool by the first step, as a multiple of the step."""
 STROKE_MM, LARGEST_RATIO = 1.0, 1000.0
 """Stroke of the bar either way; largest factor by which a wrong unit enlarges a step."""
 PLACES = 24

@@ -114,7 +114,7 @@ def place_of(source: Path) -> Path:
 
 
 def drop(source: Path, to: Place, *, machine: str, form: str, now: datetime) -> Drop:
-    """Put exported files where a control reads them, keep what lay there, and read them back.
+    """Put exported files where a control reads them, keep the files that were there, and read the new ones back.
 
     Raises
     ------

@@ -102,7 +102,7 @@ def valid_approval(
 
 
 def same_person(one: str, other: str) -> bool:
-    """Whether two names belong to the same person: letter case and outer blanks do not count."""
+    """Whether two names belong to the same person: letter case and outer blanks are ignored."""
     return one.strip().casefold() == other.strip().casefold()
 
 

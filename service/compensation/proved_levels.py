@@ -26,7 +26,7 @@ ONE_TABLE = (
 
 @dataclass(frozen=True, slots=True)
 class LevelStatus:
-    """The capabilities that count for a push now. ``hint``: a warning for people; empty when they are proved."""
+    """The capabilities that a push may rely on now. ``hint``: a warning for people; empty when they are proved."""
 
     capabilities: Capabilities
     hint: str
@@ -55,7 +55,7 @@ def last_proof(store: Store, site: Site) -> Doc | None:
 
 
 async def level_status(controller: Identity, store: Store, site: Site) -> LevelStatus:
-    """Identify the controller and return the capabilities that count for a push into it."""
+    """Identify the controller and return the capabilities that a push into it may rely on."""
     info = await controller.identify()
     doc = await asyncio.to_thread(last_proof, store, site)
     if doc is not None and doc["identity"] == identity(info):

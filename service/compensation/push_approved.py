@@ -37,7 +37,7 @@ async def push_approved(site: Site, store: Store, order: PushOrder, *, clock: Cl
     Raises
     ------
     MachineInUse
-        Another process has the machine: nothing was begun, and the attempt does not count.
+        Another process has the machine: nothing was begun, so this is no attempt.
     """
     with lock_machine(site.urls.cnc):
         try:

@@ -319,7 +319,7 @@ async def finish_when_safe(
     StillActive
         The machine did not become safe within ``limit_s``.
     TableMismatch
-        The controller holds a table that the journal does not know: a person must look.
+        The controller holds a table that is not in the journal: a person must look.
     """
     book = await StoreBook.last(store, site.name, clock, site.control)
     if book is None or (await book.entries())[-1].state in TERMINAL - {PushState.OPERATOR}:

@@ -1,7 +1,7 @@
 """Bring the previous table back on a person's order: a push of its own, by the same push machine and into the same journal.
 
-No probe and no verification is measured: the journal knows the image, byte for byte, as one that was in force, verified or put there by
-a person. Everything else is as for any push: interlocks, lease, two read-backs, compare-and-swap, and rollback if the push breaks off.
+No probe and no verification is measured: the journal holds the image, byte for byte, of a table that was in force, verified or put there
+by a person. Everything else is as for any push: interlocks, lease, two read-backs, compare-and-swap, and rollback if the push breaks off.
 
 `ordered_rollback` is the order given to the service: it locks the machine and touches only the table that the person saw in force.
 """
@@ -81,9 +81,9 @@ async def rollback(
     Raises
     ------
     TableRefused
-        The journal knows no such table, or the push that restores it was rolled back.
+        The journal holds no such table, or the push that restores it was rolled back.
     TableMismatch
-        The journal does not know the table in force: a person must look first.
+        The table in force is not in the journal: a person must look first.
     StoreError
         The journal was changed after it was written.
     PushNotBegun, StillActive

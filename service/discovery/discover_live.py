@@ -60,8 +60,8 @@ def addition_count(store: Store, name: str) -> int:
 def find_addition(store: Store, campaign: Campaign, plan: CampaignPlan, after_s: float = 0.0) -> LiveAddition:
     """Return what is done and what remains of a plan that continues a campaign; a campaign begun for the same plan is resumed.
 
-    A set-up counts only if all its tests were completed in one mounting. After an interrupted test the equipment in the machine is unknown:
-    the operator is first asked to remove it, then mounts it again under the name of a new set-up.
+    A set-up is done only if all its tests were completed in one mounting. After an interrupted test the equipment in the machine is
+    unknown: the operator is first asked to remove it, then mounts it again under the name of a new set-up.
 
     Raises
     ------

@@ -28,7 +28,7 @@ def drift_text(store: Store, made: StoredProposal) -> str:
     """Return the linear error that changed most since the previous solution, with U; without a previous one, the largest.
 
     ``made``: proposal with the new solution. The text is empty if no linear error is known. Only solutions measured with the same
-    compensation table are compared. Uncertainty that both solutions share (the laser's wavelength) counts twice in U.
+    compensation table are compared. Uncertainty that both solutions share (the laser's wavelength) is included twice in U.
     """
     new = store.solutions.get(made.proposed.solution_id)
     known = {k: v for k, v in stored_solution(new.doc, new.id).mean_over_volume.items() if k in NAMES}

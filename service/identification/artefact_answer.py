@@ -16,7 +16,7 @@ from abbe.models.solvers.plate_fit import plate_fit
 from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 
 SENSED = 1e-3
-"""Direction cosine up to which an axis counts as not sensed: no reading of the campaign has a larger one along it."""
+"""An axis is not sensed if no reading of the campaign has a larger direction cosine along it."""
 COVERAGE = 2.0
 ONE_PLANE_MM = 5.0
 """Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""

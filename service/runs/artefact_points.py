@@ -18,9 +18,9 @@ from abbe.service.errors import MeasurementFault
 FEWEST = 3
 """Smallest number of sensed components of a run."""
 POLE = 1.5
-"""A ball's height comes from one touch and its radius, the other directions from two touches: variance larger by this share."""
+"""Share by which the variance of a ball's height is larger: one touch and the radius give it, two touches the other directions."""
 EXACT = 1e4
-"""Weight of a calibrated length: its uncertainty is an unknown of its own."""
+"""Weight of a calibrated length, whose error is a separate unknown."""
 
 
 def artefact_data(run: Run, setup: ArtefactSetup) -> RunData:
@@ -109,7 +109,7 @@ def _signs(run: Run, setup: ArtefactSetup, points: ArtefactPoints, rows: NDArray
 
 
 def calibrated_lengths(runs: list[Run]) -> tuple[RunData, ...]:
-    """Return the calibrated lengths of all probed artefacts of the runs, as runs of their own."""
+    """Return the calibrated lengths of all probed artefacts as additional runs, one per artefact."""
     known = {r.setup.artefact: r.setup.features for r in runs if isinstance(r.setup, ArtefactSetup) and r.setup.by_machine}
     return tuple(_lengths(name, found) for name, found in known.items() if found is not None and found.calibrated_lengths)
 

@@ -27,7 +27,7 @@ CLOCKS_S = 60.0
 
 
 def case_of(campaign: dict[str, Any], machine: Machine, runs: list[Run]) -> Case:
-    """Turn an ``abbe-campaign/1`` object and its runs into a case; points of artefacts are no part of it.
+    """Turn an ``abbe-campaign/1`` object and its runs into a case, without points of artefacts.
 
     Raises
     ------
@@ -55,7 +55,7 @@ def _run(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Case
 
 
 def path_of(run: Run, machine: Machine, vertical: int, dead_path_mm: float) -> Path:
-    """Return what a simulation needs to know of a run: positions, times, mounting and temperatures, but no readings."""
+    """Return the data of a run for a simulation: positions, times, mounting and temperatures, but no readings."""
     setup, t_s, q = run.setup, run.columns.t_s, run.columns.q_mm
     temp = run.columns.temperatures_c
     first = {s: v[:1] for s, v in temp.items()}

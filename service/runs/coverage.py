@@ -1,10 +1,10 @@
 """Share of its commanded path that a run has read, and whether the run is judged: one rule for results, reports, pages and comparisons.
 
 A run gives no result if it was stopped, aborted, interrupted or failed, or has read less than `LEAST` of its path. A complete run with a
-few counted gaps is judged. A run that was measured in pieces counts with all its pieces.
+few counted gaps is judged. A run that was measured in pieces is judged with all its pieces.
 
 The module also gives the range of positions of runs (beyond it a map is assumed), and axis and angle of a ball-bar path: coverage counts
-its turns, pages and the live view draw it.
+turns about this axis; pages and the live view draw the angle.
 """
 
 from __future__ import annotations

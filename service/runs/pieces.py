@@ -1,4 +1,4 @@
-"""Paths measured in pieces: the progress of an interrupted run, and the readings of each piece that count."""
+"""Paths measured in pieces: the progress of an interrupted run, and the readings of each piece that are used."""
 
 from __future__ import annotations
 
@@ -80,6 +80,6 @@ def along_mm(start: RunStart, end: RunEnd, columns: Columns) -> F1:
 
 
 def counted_columns(record: RunRecord, columns: Columns, to_mm: float) -> Columns:
-    """Return the readings of an interrupted run that count: those before position ``to_mm`` on the whole path."""
+    """Return the readings of an interrupted run that are used: those before position ``to_mm`` on the whole path."""
     start = record.start
     return columns.rows(start.commanded.offset_mm + along_mm(start, record.end, columns) < to_mm)

@@ -32,7 +32,7 @@ U_DELAY_S = 2e-3
 COLLECTS_MS = 16
 """Time for which a serial adapter collects bytes, possibly in step with the samples."""
 SURE = 3.0
-"""A drift or a disagreement counts from this multiple of its standard uncertainty."""
+"""A drift or a disagreement is significant from this multiple of its standard uncertainty."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,7 +141,7 @@ BarSamples = npt.NDArray[np.void]
 
 
 BLOCK = 2**15
-"""Samples looked at together: their status fits into a processor's cache, and is mostly one and the same."""
+"""Number of samples examined together: their status words fit into a processor's cache and are mostly equal."""
 Rows = slice | npt.NDArray[np.intp]
 
 
@@ -368,9 +368,9 @@ def laser_columns(records: Sequence[LaserRecord], start: RunStart, beam: F1) -> 
     Returns
     -------
     Columns
-        With ``status``, ``signal_permille``, and ``temp_air_C``, ``pressure_air_Pa`` if every record has them. Deviations count from the
-        first record, or from the laser's zero if that record is missing. A missing reading is a row with the commanded position, deviation
-        0 and ``valid`` 0, so that rows still match standstills.
+        With ``status``, ``signal_permille``, and ``temp_air_C``, ``pressure_air_Pa`` if every record has them. Deviations are relative to
+        the first record, or to the laser's zero if that record is missing. A missing reading is a row with the commanded position,
+        deviation 0 and ``valid`` 0, so that rows still match standstills.
     """
     air = {column: np.array([getattr(one, key) for one in records], dtype=np.float64) for column, key in _AIR.items()}
     return Columns(

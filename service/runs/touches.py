@@ -79,10 +79,11 @@ def _repeatability_mm(spread_mm: float, repeats: int, resolution_mm: float) -> f
 def touch_columns(records: Sequence[TouchRecord], start: RunStart, pose: ArtefactPose) -> Columns:
     """Convert the records of an artefact's run to columns: one row per touched feature (docs/schemas/artefact-run.schema.json).
 
-    Touches of the qualification sphere are no rows (`qualified_mm`).
+    Touches of the qualification sphere give no row (`qualified_mm`).
 
     ``u_mm`` is the repeatability of a centre along a direction that was touched from both sides: the pooled spread of repeated touches
-    divided by the root of their number, and the travel between two readings of the probe input, an error that repeated touches share.
+    divided by the root of their number, combined with the travel between two readings of the probe input, an error that repeated touches
+    do not reduce.
     A ball's height comes from one side and the radius, so it is less certain (`abbe.service.runs.artefact_points.POLE`).
     """
     records = [record for record in records if not record.qualifies]

@@ -44,7 +44,7 @@ from abbe.service.sequences.steps import (
 )
 
 LEAD_S, LEAD_MM = 0.5, 5.0
-"""Minimum time and length of the lead before readings count: the axes reach constant feed and take up their lost motion."""
+"""Minimum time and length of the lead before readings are used: the axes reach constant feed and take up their lost motion."""
 SAME_MM = 0.0015
 """Allowed median change of the readings on the stretch: minutes of drift, but not a displaced cup."""
 STEADY_MM = 0.1

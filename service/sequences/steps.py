@@ -71,7 +71,7 @@ class ReadLaser:
 class RecordPath:
     """Run a polyline at constant feed while the ball-bar streams. The machine stands at its first point.
 
-    ``measured``: numbers of the first and last point that count; feed-in is before, feed-out after them. None: all points count.
+    ``measured``: numbers of the first and last measured point; feed-in is before, feed-out after them. None: all points.
     """
 
     points_mm: tuple[Point, ...]

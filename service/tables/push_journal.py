@@ -196,7 +196,7 @@ class JournalView:
 
     @property
     def changes(self) -> list[PushEntry]:
-        """Entries that put a table into force permanently: kept, or accepted by a person. Pushes that were rolled back do not count."""
+        """Entries that put a table into force permanently: kept, or accepted by a person. Pushes that were rolled back are left out."""
         return [e for e in self.entries if e.state in (PushState.KEEP, PushState.ACCEPTED)]
 
     def kept(self, before: datetime | None = None) -> list[PushFacts]:

@@ -1,4 +1,4 @@
-"""Runs grouped into tests of ISO 230: approaches of positions, diagonals, circles; and the readings of each that count."""
+"""Runs grouped into tests of ISO 230: approaches of positions, diagonals, circles; and the readings of each that are used."""
 
 from __future__ import annotations
 

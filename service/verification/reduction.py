@@ -83,7 +83,7 @@ class Way:
 def scale_temperature(runs: Sequence[Run], axis: str, material: AxisMaterial | None) -> ScaleTemperature | None:
     """Temperature of an axis' scale during a test: mean of its sensor if every run recorded it, else the stated one, else None.
 
-    The recorded range counts as a rectangular distribution on top of the stated uncertainty. None, too, if the sensor was out of bounds.
+    The recorded range is added to the stated uncertainty, as a rectangular distribution. None, too, if the sensor was out of bounds.
     """
     if _out_of_bounds(runs, axis):
         return None

@@ -116,7 +116,7 @@ def charts(records: Sequence[VerificationRecord], after_utc: datetime | None = N
     """Control chart of every figure that has a limit in the latest check with figures.
 
     ``records`` may have any order; checks without a figure or a valid uncertainty are left out of its series. Only checks after
-    ``after_utc`` count, because a new table or a repair begins a new series.
+    ``after_utc`` are used, because a new table or a repair begins a new series.
     """
     docs = _docs(records, after_utc)
     if not docs:

@@ -125,8 +125,8 @@ def verified_by(store: Store, machine: str, *, control: str = "", strange: bool 
     control : str
         Identity of its control; empty: unknown, use the journal last used under this name.
     strange : bool
-        The controller holds a table that the journal does not expect (`strange_table`). The last heartbeat of the machine's service counts
-        as well.
+        The controller holds a table that the journal does not expect (`strange_table`). The last heartbeat of the machine's service is
+        used as well.
 
     Raises
     ------

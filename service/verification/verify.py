@@ -68,7 +68,7 @@ class VerificationFigures:
 def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> VerificationFigures:
     """Figures of a verification's runs: plain body diagonals and at most one helix.
 
-    ``room_c``: lowest and highest air temperature that a person states for the room, which counts where no run recorded one.
+    ``room_c``: lowest and highest air temperature that a person states for the room, used where no run recorded one.
 
     Raises
     ------
@@ -95,7 +95,7 @@ def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> Verif
 
 
 def pose_figures(runs: list[Run], known: JointSolution, room_c: tuple[float, float] | None = None) -> VerificationFigures:
-    """Figures of artefacts in poses that the solution ``known``, which knows their form, did not use; ``room_c`` as in `figures`.
+    """Figures of artefacts whose form the solution ``known`` contains, in poses that it did not use; ``room_c`` as in `figures`.
 
     Raises
     ------
@@ -342,7 +342,7 @@ def alarm(doc: dict[str, Any]) -> dict[str, Any]:
 def cause_of(cause: Exception) -> CheckFailure:
     """Return code, one line of cause, remedy and device of an error.
 
-    Of a group of errors, the first one of a driver or of Abbe counts: if several devices fail together, the first failure matters.
+    Of a group of errors, the first one of a driver or of Abbe is used: if several devices fail together, the first failure matters.
     """
     known = _first(cause)
     if isinstance(known, DriverError):

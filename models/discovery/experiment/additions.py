@@ -314,7 +314,7 @@ def _again(p: Path, start: float, label: str, machine: Machine) -> CaseRun:
 def blind_spots(case: Case) -> tuple[BlindSpot, ...]:
     """Return the blind spots of a campaign's identify runs, each with the measurement that would cover it.
 
-    Runs with other roles do not count, because the search does not use them.
+    Runs with other roles are left out, because the search does not use them.
     """
     paths = [r.path for r in case.of("identify")]
     bars, lasers = [p for p in paths if p.kind == "bar"], [p for p in paths if p.kind == "laser"]

@@ -24,7 +24,7 @@ from abbe.models.effects.path import Path, Places
 THIN = 100
 """Approximate number of readings kept of each old run; each also represents readings left out."""
 ENOUGH = 5.0
-"""Separations above this many sigmas count as this many."""
+"""Separations are capped at this many sigmas."""
 WORTH, LEAST = 2.0, 0.02
 """`WORTH`: least gain in sigmas of a test that is worth its time. `LEAST`: a test that gains fewer sigmas is useless."""
 NOISE_MM = {"bar": 4e-4, "laser": 3e-4}

@@ -305,7 +305,7 @@ def _bar_scatter(paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, .
 def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
     """Find the quarter of the sphere in which readings scatter more than in the rest, in nearly every run (`IN_RUNS`) that passes it.
 
-    A deviation of the mean that neighbours share does not count (as in `abbe.models.discovery.variance.spectrum.gated_roughness`).
+    A deviation of the mean that neighbours share is left out (as in `abbe.models.discovery.variance.spectrum.gated_roughness`).
     """
     best: tuple[float, float, str, tuple[F1, ...]] | None = None
     keys = [f"{s}{AXES[a]}{t}{AXES[b]}" for a, b in ((0, 1), (1, 2), (2, 0)) for s in "+-" for t in "+-"]
@@ -333,7 +333,7 @@ def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple
 def _two_levels(runs: list[tuple[F1, NDArray[np.bool_]]]) -> tuple[float, float]:
     """Return the gain in log likelihood of two levels of noise over one, and their ratio, from squared readings inside and outside, by run.
 
-    The largest `FEW` squares of a run do not count.
+    The largest `FEW` squares of a run are left out.
     """
     inside, outside = (np.concatenate([np.sort(q[w == side])[:-FEW] for q, w in runs]) for side in (True, False))
     a, b = float(np.mean(inside)), float(np.mean(outside))

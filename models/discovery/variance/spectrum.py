@@ -33,7 +33,7 @@ LEAST_READINGS = 12.0
 ALIKE = 1.94
 """Divisor for squared second differences, which are correlated from reading to reading for white noise."""
 FEW = 3
-"""The gain of this many largest readings does not count, because a reversal that the mean model misses by one reading is not roughness."""
+"""The gain of this many largest readings is left out, because a reversal that the mean model misses by one reading is not roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
 
 
@@ -56,7 +56,7 @@ class SpectralLine:
 class _Spectrum:
     """Spectrum of one run over aliased frequencies 0 to ``rate_hz``; r: residuals, u_a: the bar's direction cosine along the axis.
 
-    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both are zero at frequencies that do not count. ``proves``:
+    ``size``: |sum r u_a e^-iwt| / sigma; ``energy``: (sum u_a^2) / sigma^2; both are zero at excluded frequencies. ``proves``:
     whether a line at this frequency is too fast to come from the form of balls or machine (`LOBES_PER_TURN`).
     """
 
@@ -188,8 +188,8 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
     """Find for each axis the most likely speed below which the readings are rougher; axes that never creep are left out.
 
     A saw-tooth of half height h decreases with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each
-    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are equal in neighbouring readings do not
-    count: they may be residues of the mean model at a reversal.
+    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are equal in neighbouring readings are left
+    out: they may be residues of the mean model at a reversal.
     """
     look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
     values = np.concatenate(rest)

@@ -115,6 +115,7 @@ class VolumetricMap:
     deviation_mm : array, same shape
         Actual minus nominal.
     tool_mm : array, shape (3,)
+        Vector from the spindle reference to the functional point.
     """
 
     axes_mm: F3

@@ -24,13 +24,13 @@ HIDDEN, TOLERANCE = 0.02, 1e-3
 counts, as a share of the largest: poses that differ by only a millimetre give no information about micrometres."""
 FLAT = 1e-3
 SHIFT = 0.37
-"""Proposed shift as a share of a pitch; not a simple fraction, so that the shift is none of the screw's lead either."""
+"""Proposed shift as a share of a pitch; not a simple fraction, so that it is no simple fraction of the screw's lead either."""
 
 
 @dataclass(frozen=True)
 class PoseRank:
-    """``rank`` of the ``of`` fields without rigid motions; ``hidden``: named fields that leave no trace; ``cures``: further poses with the
-    rank that they would give and errors that they would show."""
+    """Fields that the poses show: ``rank`` out of ``of``, without rigid motions. ``hidden``: named fields that leave no trace; ``cures``:
+    further poses, each with the rank that it would give and the errors that it would show."""
 
     plane: str
     rank: int

@@ -1,7 +1,7 @@
 """Observed information of a campaign: rank and hidden combinations of the coefficients, and status of every parameter and error motion.
 
 Convention: columns of unit length, unknown set-up errors projected out, singular values counted down to 1e-9 (rank) and 1e-3 (effective
-rank) of the largest. Priors do not count, because typical sizes are not measured. Measured or certified knowledge of the set-up
+rank) of the largest. Priors are not used, because typical sizes are not measured. Measured or certified knowledge of the set-up
 (`Knowledge`) counts like readings: a calibrated bar, a laser whose drift the maker states.
 
 The rank does not depend on the functions that describe the error motions. The effective rank does: it is higher with Legendre polynomials,
@@ -388,6 +388,6 @@ def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -
     """Names of the error motions that may be written into tables of their own, because they rest on readings.
 
     Such a motion has no coefficient in a hidden combination, and at least 90 % of its information comes from the readings (with ``weak``:
-    10 %). Other motions may still be corrected where only the sum of all motions counts: in a grid of the volume for the measured tool.
+    10 %). Other motions may still be corrected where only the sum of all motions matters: in a grid of the volume for the measured tool.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))

@@ -250,7 +250,7 @@ class Runtime:
 
 
 def runtime(blocks: tuple[Block, ...], pace: PathDynamics) -> Runtime:
-    """Return the time of all blocks: each line or arc from standstill to standstill; moves without a stop between them count as one."""
+    """Return the time of all blocks: each line or arc from standstill to standstill; moves without a stop between them are one move."""
     moving, resting, here = 0.0, 0.0, None
     smooth, run_mm, run_feed = False, 0.0, 0.0
     for block in blocks:

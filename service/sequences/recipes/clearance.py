@@ -96,7 +96,7 @@ class Boxes:
         return cls(tuple(one.id for one in known), low, high, np.array(origin_mm), matrix)
 
     def gaps_mm(self, places_mm: Array, up: Array, part: ProbePart) -> Array:
-        """Return the gaps as `Solids` does; the part counts as round at both ends, so a flat end may seem nearer than it is."""
+        """Return the gaps as `Solids` does; the part is taken as round at both ends, so a flat end may seem nearer than it is."""
         return self._rod(places_mm, up, part.from_mm, part.to_mm) - part.radius_mm
 
     def _rod(self, places_mm: Array, up: Array, from_mm: float, to_mm: float) -> Array:
