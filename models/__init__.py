@@ -1,1 +1,1 @@
-"""Models know physics: pure functions of numpy arrays, no I/O, clock or logging."""
+"""The physics: pure functions of numpy arrays, without I/O, clock or logging."""

@@ -228,7 +228,7 @@ def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
     centre_mm, at_mm : array, shape (3,)
         Centre of the sphere; a point on it.
     along : array, shape (3,)
-        Direction of motion at ``at_mm``; only its component tangential to the sphere counts.
+        Direction of motion at ``at_mm``; only its component tangential to the sphere is used.
     angles_rad : array, shape (n,)
 
     Returns

@@ -1,6 +1,6 @@
 """Trend of a series of check results ("figures"): whether it drifts, since when, and when it will reach its limit.
 
-Figures come at any times, each with a standard uncertainty. Only the ratios of these uncertainties count: mean and scale are estimated
+Figures come at any times, each with a standard uncertainty. Only the ratios of these uncertainties matter: mean and scale are estimated
 from the series itself (Hawkins' self-starting chart). The difference between a figure and the mean of all earlier ones follows Student's t
 and is transformed to a standard normal variable. While nothing changes, these variables are independent, so that the false-alarm rates
 of CUSUM (ISO 7870-4) and EWMA (ISO 7870-6) hold from the third figure on.
@@ -38,7 +38,7 @@ FARTHEST = 20.0
 """Longest forecast, as a multiple of the time that the series covers."""
 JUMP_SIGMAS = 5.0
 JUMP_SHARE = 0.25
-"""Smallest jump that counts: in standard uncertainties, and as a share of the limit."""
+"""Smallest jump that is reported: in standard uncertainties, and as a share of the limit."""
 
 
 @dataclass(frozen=True)
@@ -83,7 +83,7 @@ def standardised(values: F1, u: F1) -> F1:
     Parameters
     ----------
     values, u : array (n,)
-        Figures and their standard uncertainties, in order of time. Only the ratios of ``u`` count.
+        Figures and their standard uncertainties, in order of time. Only the ratios of ``u`` matter.
 
     Raises
     ------

@@ -38,7 +38,7 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
 
     Half of (out - back) is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
     length. Readings are paired by their position on the line, so a missing reading removes only its own pair. ``turning_mm``: where the
-    machine turned beyond the ends, (3,) each; these are no positions of the test.
+    machine turned beyond the ends, (3,) each; these are not positions of the test.
     """
     assert run.beam is not None
     s = np.round((run.axes_mm - run.axes_mm[0]) @ run.beam, 4)

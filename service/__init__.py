@@ -1,1 +1,1 @@
-"""Service knows the job: it measures, solves, compensates, verifies, stores and reports."""
+"""The service: measure, solve, compensate, verify, store and report."""

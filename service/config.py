@@ -164,7 +164,7 @@ def _overrides() -> dict[str, Any]:
 
 
 def _place(parts: list[str]) -> list[str]:
-    """Return the keys of a variable, spelled as in the file; keys that the file does not know, in small letters."""
+    """Return the keys of a variable, spelled as in the file; keys that are not in the file, in small letters."""
     place, keys = [], _keys(MachineFile)
     for part in parts:
         place.append(next((key for key in keys if key.upper() == part), part.lower()))

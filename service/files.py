@@ -57,7 +57,7 @@ def lock_at_once(descriptor: int) -> None:
 
 
 def read_plain(path: Path, most: int) -> bytes:
-    """Read a whole file from outside Abbe. A link counts as its target.
+    """Read a whole file from outside Abbe. A link is followed to its target.
 
     A pipe is not waited for, and a device is not even opened: opening a serial port switches its control lines.
 

@@ -71,10 +71,10 @@ LOOSER: Mapping[str, Looser] = MappingProxyType(
         "schedule.name": "stated",
     }
 )
-"""What makes a value allow more than before. ``more``, ``less``: a larger, a smaller one; ``wider``: a range that leaves the old one, or
-none any more; ``added``: further entries; ``later``: a later day, or a first one; ``stated``: any value that is stated; ``changed``: any
-other one; ``raised``: any other one but those of `UNRAISED`; ``dropped``: any other one than before, unless that was ``any``. A new
-schedule allows more by its name, a removed one nothing."""
+"""Changes of a value that allow more than before. ``more``, ``less``: a larger, a smaller value; ``wider``: a range that is not inside the
+old one, or no range any more; ``added``: further entries; ``later``: a later day, or the first; ``stated``: any stated value; ``changed``:
+another value; ``raised``: another value, except those of `UNRAISED`; ``dropped``: another value, unless the old one was ``any``. Of a new
+schedule only the name is judged, of a removed schedule nothing."""
 UNRAISED = ("skip", "none")
 _IS_LOOSER: Mapping[Looser, Callable[[Any, Any], bool]] = MappingProxyType(
     {

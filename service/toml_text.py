@@ -20,7 +20,7 @@ _LEFT = re.compile(rf"[ \t]*{_NAME}(?:[ \t]*\.[ \t]*{_NAME})*[ \t]*=")
 _PART = re.compile(r"([^.\[\]]+)(?:\[([1-9]\d*)\])?")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Path = tuple[str | int, ...]
-"""Keys and, behind that of a list of tables, the number of the table, from 0."""
+"""Keys; the key of a list of tables is followed by the number of the table, from 0."""
 
 
 class NotEditableError(ValueError):
@@ -53,7 +53,7 @@ def key_lines(text: str) -> dict[str, int]:
 
 
 def path_of(key: str) -> Path:
-    """A dotted key in parts. Raises ValueError for a text that is none."""
+    """A dotted key in parts. Raises ValueError for any other text."""
     parts: list[str | int] = []
     for part in key.split("."):
         found = _PART.fullmatch(part)

@@ -194,7 +194,7 @@ def stands(t_s: F1, y: F1, *, smallest_move: float, least_s: float, step: float 
     smallest_move : float
         Smallest planned move between standstills, in the unit of ``y``.
     least_s : float
-        Shortest standstill that counts.
+        Shortest standstill that is reported.
     step : float
         Smallest step of the readings: a coarse instrument at rest flickers by one or two.
     """

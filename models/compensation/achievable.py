@@ -64,7 +64,7 @@ class MotionTables:
     motions, u : dict
         ``"EXX"`` ..: values at the grid of the moving axis, mm or rad, and their standard uncertainty. Missing motions are zero.
     squareness_rad, u_squareness_rad : dict
-        ``"C0Y"`` ..; travel counts from the start of the stroke.
+        ``"C0Y"`` ..; travel is measured from the start of the stroke.
     left_out : tuple of str
         Motions not in the tables: not observable by themselves, or not named by the caller.
     any_tool : bool

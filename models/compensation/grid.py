@@ -258,8 +258,8 @@ def compensable_nodes(
     """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
     The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes are also excluded where an
-    error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors that count
-    neither in the uncertainty nor in this error.
+    error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors left out of the
+    uncertainty and of this error.
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

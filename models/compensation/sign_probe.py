@@ -78,7 +78,7 @@ def bar_shift(directions: F2, before_mm: F1, with_step_mm: F1, after_mm: F1, u_m
     before_mm, with_step_mm, after_mm : array, shape (n,)
         Readings; positive means longer. A drift at a constant rate cancels.
     u_mm : float
-        Standard uncertainty of one reading; if the residuals scatter more, their scatter counts.
+        Standard uncertainty of one reading; if the residuals scatter more, their scatter is used.
     share : float
         Time of the readings with the step, as a share of the time between those before and after.
 

@@ -71,7 +71,7 @@ class CyclicError:
     """Cyclic error of an interferometer, in the unit of ``fringe`` (displacement per period of its signals).
 
     ``ellipse``: None for a linear run; ``scatter``: robust standard deviation of the residuals, relative to the radius for signals;
-    ``outliers``: share of samples that do not count.
+    ``outliers``: share of rejected samples.
     """
 
     orders: tuple[CyclicOrder, ...]

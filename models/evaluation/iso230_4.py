@@ -20,8 +20,8 @@ BINS = 360
 FULL_RAD = np.deg2rad(350.0)
 """A path that covers less is an arc (`OnePath.is_whole`), and its least squares centre is less certain."""
 ZONE_POINTS = 2000
-"""Largest number of readings for the minimum zone. A longer path is cut into `ZONE_POINTS` / 2 stretches; their highest and lowest readings
-count."""
+"""Largest number of readings for the minimum zone. A longer path is cut into `ZONE_POINTS` / 2 stretches; their highest and lowest
+readings are used."""
 
 
 @dataclass(frozen=True, slots=True)

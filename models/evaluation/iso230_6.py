@@ -1,4 +1,5 @@
-"""ISO 230-6: displacement along body and face diagonals. Each diagonal is evaluated like an axis by ISO 230-2; the largest counts."""
+"""ISO 230-6: displacement along body and face diagonals. Each diagonal is evaluated like an axis by ISO 230-2; the result is the largest
+figure."""
 
 from __future__ import annotations
 

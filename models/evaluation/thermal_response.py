@@ -37,7 +37,7 @@ CHANCE = 0.01
 """A shift of several runs is claimed below this p-value, which is corrected for the number of tried beginnings and ends."""
 LEAST_RUNS = 5
 UNLIKELY = 7.0
-"""A time constant does not count if its log evidence is lower than the best by more than this: odds of one to a thousand."""
+"""A time constant is left out if its log evidence is lower than the best by more than this: odds of one to a thousand."""
 LEAST_U_MM = 1e-5
 """Least standard uncertainty of a predicted displacement; readings and temperatures do not allow less."""
 

@@ -193,8 +193,8 @@ class Straightened:
 class ErrorMotions:
     """Error motions as functions of the axis positions (file format ``abbe-errors/1``, docs/how-to/errors.md).
 
-    Squareness multiplies the travel from AXIS ZERO. `abbe.models.geometry.bases` counts from the start of the stroke; the resulting maps
-    differ by a constant offset.
+    Squareness multiplies the travel from AXIS ZERO. In `abbe.models.geometry.bases` the travel begins at the start of the stroke; the
+    resulting maps differ by a constant offset.
 
     Parameters
     ----------

@@ -213,7 +213,7 @@ def squareness_motions(axes_mm: F2, start_mm: F1 | None = None) -> F4:
     axes_mm : array, shape (n, 3)
     start_mm : array, shape (3,), optional
         Position at which the travel of X, Y, Z is zero. Default: the axis zero, as in the papers' matrices (−αX). Abbe's solutions
-        (`abbe.models.geometry.bases.term_values`) count from the start of the stroke, ``machine.stroke_mm[:, 0]``. To first order the
+        (`abbe.models.geometry.bases.term_values`) use the start of the stroke, ``machine.stroke_mm[:, 0]``. To first order the
         choice only shifts the whole map by a constant.
 
     Returns

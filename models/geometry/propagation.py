@@ -140,7 +140,7 @@ def deviation_covariance(
     Parameters
     ----------
     covariance : (names, matrix)
-        Names of parameters, and their covariance, shape (p, p), in products of their units. Other parameters count as certain.
+        Names of parameters, and their covariance, shape (p, p), in products of their units. Other parameters are taken as certain.
     at, exact
         As in `sensitivity`.
 

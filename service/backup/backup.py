@@ -115,7 +115,7 @@ def digest_of(path: Path) -> str:
 
 
 def file_list(folder: Path) -> dict[str, ListedFile | None]:
-    """Return every file below a folder except the list and the pieces, by relative path; None for what is no plain file. Raises OSError."""
+    """Return the files below a folder by relative path, except list and pieces; None for anything but a plain file. Raises OSError."""
     found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
         if path.parent == folder / PIECES:

@@ -38,7 +38,7 @@ def cut(database: Path, folder: Path, earlier: Path | None) -> ListedPieces:
     Raises
     ------
     OSError
-        A file cannot be read or written. Where the disk knows no hard links, each piece is written.
+        A file cannot be read or written. Where the disk has no hard links, each piece is written.
     """
     folder.mkdir(mode=0o700)
     names, size, new = list[str](), 0, 0

@@ -7,7 +7,7 @@ The core reports its state (`Begin`, `Snapshot`, `Jobs`, `LivePath`, `LiveSample
 `LiveMachine`, `Answer`); the web process forwards what a person
 requests (`StartJob`, `SteerJob`, `ConfirmPrompt`, `RollBack`, `PushNow`, `ChangeFile`). No request can name a device, a register or a file,
 or carry a table: a request names the table in force by its push and CRC, and the push journal determines which table replaces it; a change
-of the machine file reaches those sections alone that `abbe.service.machine_changes.RIGHTS` lists.
+of the machine file reaches only the sections that `abbe.service.machine_changes.RIGHTS` lists.
 """
 
 from __future__ import annotations

@@ -171,7 +171,7 @@ def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
 
 
 def check_endings(*targets: Path | None) -> None:
-    """Refuse a report's file with an unknown ending, before the work; None is no file. Raises FileFormatError."""
+    """Refuse a report's file with an unknown ending, before the work; None: no file. Raises FileFormatError."""
     if given := list(filter(None, targets)):
         from abbe.service.rendering.document_page import form_of
 
@@ -180,7 +180,7 @@ def check_endings(*targets: Path | None) -> None:
 
 
 def check_inputs(*files: Path) -> None:
-    """Refuse a file or folder that does not exist, before what reads it is loaded. Raises FileFormatError."""
+    """Refuse a file or folder that does not exist, before its reader is loaded. Raises FileFormatError."""
     from abbe.service.errors import FileFormatError
 
     for file in files:

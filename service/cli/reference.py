@@ -37,7 +37,7 @@ PARTS: dict[Source, tuple[str, str]] = {
     "math.md": ("Stated by math.md, the specification of Abbe's formulas", "numbers of math.md"),
     "own check": ("Own checks: numbers that are put in must come back", "own checks (no printed numbers)"),
 }
-"""For each source of numbers, the title of its table (empty: the paper's title), and the word for its numbers in the counts."""
+"""For each source of numbers, the title of its table (empty: the paper's title), and the name of its numbers in the summary."""
 
 LEGEND = (
     "reproduced: computed from independent inputs, and equal to the last printed digit; consistent: off by no more than rounded inputs"

@@ -28,14 +28,14 @@ from abbe.service.users.roles import Permission
 log = structlog.get_logger("abbe.file")
 ACTION = "machine file"
 FILE_ONLY = "limits.two_people"
-"""Nobody switches this off on the page: the one person who could is the one it keeps from deciding alone."""
+"""Never changed on the page: it keeps a single person from deciding alone, so no single person may switch it off."""
 LONGEST_TARGET = 400
 CLOSED = "{key} is different in the file: start the service again on its computer to use the new value"
 
 
 @dataclass(frozen=True, slots=True)
 class FileChangeContext:
-    """What a change needs to know.
+    """Data that a change needs.
 
     ``may(who, need)``: whether a person has a right. ``claim``: claims the machine; None while the service takes no jobs. ``push_open``:
     whether a push is unfinished. ``restart``: starts the service anew with a setup. ``cnc``: URL of the controller, if there is one.
@@ -76,7 +76,7 @@ class FileChanges:
     async def change(self, asked: ChangeFile) -> Answer:
         """Change the file, or answer why it is not changed. After "done" the service starts anew.
 
-        What has begun is brought to its end even if nobody waits for the answer any more: a written file is always taken over.
+        A change that has begun is completed even if nobody waits for the answer any more: a written file is always used.
         """
         self._work = asyncio.ensure_future(self._carried_out(asked))
         return await asyncio.shield(self._work)

@@ -49,7 +49,7 @@ async def deny(_: str) -> bool:
 
 
 async def no_alarms(_: int) -> str:
-    """Know no alarm."""
+    """Refuse to search for the cause of an alarm: there are none."""
     return "this service raises no alarms"
 
 

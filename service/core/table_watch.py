@@ -43,7 +43,7 @@ class InForce:
     unverified : str
         The push that wrote the table, if nothing has verified it; else empty.
     strange : bool
-        The table corrects something or cannot be read, and no journal of this control knows it.
+        The table corrects something or cannot be read, and is in no journal of this control.
     """
 
     bank: int
@@ -106,7 +106,7 @@ class TableWatch:
     alarms : AlarmSink
         Gets each unknown table once.
     attention : list of str
-        Texts on the page until the table is one that Abbe knows.
+        Texts on the page until the table is known.
     changed : callable
         Called when ``attention`` has changed.
     """

@@ -34,7 +34,7 @@ SOON = timedelta(days=30)
 
 @dataclass(frozen=True, slots=True)
 class Examined:
-    """One examined thing: ``good``, ``look`` (works, but look at it) or ``bad`` (Abbe cannot work), and what to do."""
+    """One finding: ``good``, ``look`` (works, but look at it) or ``bad`` (Abbe cannot work), and what to do."""
 
     what: str
     state: State

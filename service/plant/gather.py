@@ -51,7 +51,7 @@ def unit_of(key: str) -> PlantUnit | None:
 
 @dataclass(frozen=True, slots=True)
 class PlantAlarm:
-    """Something a person should look at."""
+    """An event that a person should look at."""
 
     code: str
     text: str
@@ -61,7 +61,7 @@ class PlantAlarm:
 
 @dataclass(frozen=True, slots=True)
 class ActiveTable:
-    """The active compensation table as the push journal last knew it. The controller is not asked."""
+    """The active compensation table according to the push journal. The controller is not asked."""
 
     bank: int
     crc: int
@@ -73,7 +73,7 @@ class ActiveTable:
 class PlantFacts:
     """Facts of one instant; checks and alarms newest first.
 
-    ``table``: None if the journal does not know it; ``verified``: which measurement verified it, None if unknown.
+    ``table``: None if the journal does not show it; ``verified``: which measurement verified it, None if unknown.
     """
 
     machine: str

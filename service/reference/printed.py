@@ -23,7 +23,7 @@ class Printed:
     Parameters
     ----------
     text : str
-        Digits as printed, e.g. ``"-8.5619E-05"``; trailing zeros count.
+        Digits as printed, e.g. ``"-8.5619E-05"``; trailing zeros are significant.
     bound : bool
         Whether the paper prints an upper bound instead of the number.
     last : str, optional

@@ -16,7 +16,7 @@ VALID, INVALID = 0, 255
 def document_dfq(document: Document) -> bytes:
     """The report as AQDEF: UTF-8 with byte order mark, CRLF. Equal reports give equal bytes.
 
-    A figure that is not observable is a value with attribute 255. U has no field of its own and stands in the remark of its characteristic.
+    A figure that is not observable is a value with attribute 255. U has no separate field, so it is in the remark of its characteristic.
 
     Raises
     ------

@@ -21,7 +21,7 @@ FOLDER = Path(__file__).parent / "phrases"
 ENGLISH = "en"
 LANGUAGES = (ENGLISH, "de", "ja", "ko")
 LONGEST = 2000
-"""Longer texts are no sentences."""
+"""Longest text that is translated, characters."""
 NAMED = frozenset(("campaign", "file", "machine", "run", "setup", "who"))
 """Names in braces that stand for names given by people; their texts contain no semicolon."""
 _PLACE = re.compile(r"\{(\w+)\}")
@@ -65,7 +65,7 @@ def _pattern(key: str, told: str) -> _Pattern:
 
 @lru_cache(16384)
 def phrase(lang: str, text: str) -> str:
-    """The text in a language, as far as its phrases know it."""
+    """The text in a language, as far as there are phrases for it."""
     if lang == ENGLISH or len(text) > LONGEST or not _WORD.search(text):
         return text
     bare, ends = text.removesuffix("."), _OWN_ENDS.get(lang, {})

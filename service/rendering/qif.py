@@ -1,6 +1,6 @@
 """The figures of a report as QIF 3.0 results (ISO 23952, .qif): each figure with a limit is a characteristic with its status.
 
-A characteristic of QIF has a limit. A figure without a limit therefore stands as text among the attributes of the results, beside
+A characteristic of QIF has a limit. A figure without a limit is therefore written as text among the attributes of the results, beside
 machine, days, laboratory and conditions.
 """
 

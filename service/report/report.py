@@ -282,7 +282,7 @@ def _sizes(tables: NineTables | None) -> list[ReportFigure]:
 
 def certified(document: Document, rules: Rules, measured_on: date | None, issued: date) -> Document:
     """The report as a certificate of the laboratory that the rules name, if any. ``measured_on``: day of the measurement, for a report
-    that does not know it; ``issued``: day of issue."""
+    without it; ``issued``: day of issue."""
     days = document.days or (None if measured_on is None else (measured_on.isoformat(), measured_on.isoformat()))
     return replace(document, issuer=rules.issuer, item=rules.item, days=days, issued=issued.isoformat())
 

@@ -119,7 +119,7 @@ class Ready:
         return len(self.active_s) * LOOK_S / 60.0
 
     async def watch(self) -> None:
-        """Read the controller each minute, forever, if a schedule needs a warm machine. A failed reading does not count as work."""
+        """Read the controller each minute, forever, if a schedule needs a warm machine. A failed reading is not taken as work."""
         while self._watches:
             try:
                 self._note((await self._look(False)).status)
@@ -150,4 +150,4 @@ class AlwaysReady:
         """Return at once."""
 
     def continue_from(self, earlier: Readiness) -> None:
-        """Know no history."""
+        """Ignore the history."""

@@ -28,7 +28,8 @@ NO_SLOPE = 1e-12
 STEEPEST = 1.0 + 1e-9
 """A plane faces a coordinate if its slopes over the other two coordinates are at most this; every plane faces at least one coordinate."""
 RANK_TOLERANCE = 1e-3
-"""Singular values below this share of the largest do not count: a coefficient would be a thousand times less certain than a reading."""
+"""Singular values below this share of the largest are taken as zero: a coefficient would be a thousand times less certain than a
+reading."""
 FLATNESS = 5e-3
 """Default tolerance of a plane, as a share of the second largest half width of X, Y, Z: 5 um for a square of +-1 mm. A stage with errors of
 1 um leaves its plane, but so little height gives no information: an error of 10 um per mm of height changes by 0.05 um over it."""

@@ -52,7 +52,7 @@ POINTS = 81
 RANK = 10
 UM = 1e3
 NEAR_MM = 1e-3
-"""Points within this distance of the paper's grid count as that grid."""
+"""Points within this distance of the paper's grid are taken as that grid."""
 PRINT = "quotient of two numbers of four digits"
 
 
