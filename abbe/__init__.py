@@ -27,12 +27,12 @@ if TYPE_CHECKING:
     from abbe.models.functions.polynomial import Polynomial as Polynomial
     from abbe.models.functions.table import Table as Table
     from abbe.models.machine import Machine as Machine
+    from abbe.public.answers import Estimate as Estimate
+    from abbe.public.answers import Picture as Picture
     from abbe.public.campaign import read_campaign as read_campaign
     from abbe.public.campaign import read_errors as read_errors
     from abbe.public.discovery import DiscoveryAnswer as DiscoveryAnswer
     from abbe.public.discovery import discover as discover
-    from abbe.public.estimates import Estimate as Estimate
-    from abbe.public.picture import Picture as Picture
     from abbe.public.planning import Plan as Plan
     from abbe.public.planning import plan as plan
     from abbe.public.simulation import SimulatedInstruments as SimulatedInstruments
@@ -61,7 +61,7 @@ _WHERE = {
     "Diagonal": "abbe.service.sequences.recipes.recipe",
     "Effect": "abbe.models.effects.effect",
     "ErrorMotions": "abbe.models.functions.motions",
-    "Estimate": "abbe.public.estimates",
+    "Estimate": "abbe.public.answers",
     "Form": "abbe.models.effects.effect",
     "Helix": "abbe.service.sequences.recipes.recipe",
     "SimulatedInstruments": "abbe.public.simulation",
@@ -71,7 +71,7 @@ _WHERE = {
     "NineTables": "abbe.models.compensation.tables",
     "Parameter": "abbe.models.effects.effect",
     "Path": "abbe.models.effects.path",
-    "Picture": "abbe.public.picture",
+    "Picture": "abbe.public.answers",
     "Plan": "abbe.public.planning",
     "Places": "abbe.models.effects.path",
     "Polynomial": "abbe.models.functions.polynomial",

@@ -18,7 +18,7 @@ from pydantic import ValidationError
 
 from abbe.drivers.links.urls import beside
 from abbe.service.config_schema import EXCLUSIVE_KEYS, MachineFile
-from abbe.service.domain.bounds import TEXT, WORD
+from abbe.service.domain.document import TEXT, WORD
 from abbe.service.domain.machine_file import MachineFileSummary, Origin, StatedValue
 from abbe.service.errors import ConfigError, Mistake, and_more, location_text, mistakes, nearest
 from abbe.service.secrets import mask_secrets

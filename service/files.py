@@ -1,4 +1,4 @@
-"""Read files from outside Abbe (plain files only, up to a size limit), replace a file at once, and lock Abbe's own files."""
+"""Read files from outside Abbe (plain files only, up to a size limit), write or replace a file at once, and lock Abbe's own files."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from importlib import import_module
 from pathlib import Path
 from types import ModuleType
 
-from abbe.service.errors import ConfigError
+from abbe.service.errors import ConfigError, FileFormatError
 
 PIECE = 1 << 20
 """Bytes per read: a single read of the whole limit would allocate that much memory even for the smallest file."""
@@ -122,6 +122,32 @@ def replace_file(path: Path, body: bytes) -> None:
             os.fsync(folder)
         finally:
             os.close(folder)
+
+
+def write_page(text: str | bytes, target: Path) -> None:
+    """Write a page (or the bytes of a PDF) to a temporary file and rename it: a reader sees the old file or the whole new one.
+
+    Raises
+    ------
+    FileFormatError
+        The file cannot be written.
+    """
+    aside: Path | None = None
+    try:
+        if target.is_dir():
+            raise IsADirectoryError(21, "it is a folder")
+        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
+        aside = Path(name)
+        with os.fdopen(handle, "wb") as file:
+            file.write(text.encode() if isinstance(text, str) else text)
+            file.flush()
+            os.fsync(file.fileno())
+        aside.chmod(0o644)  # mkstemp creates private files
+        aside.replace(target)
+    except OSError as error:
+        if aside is not None:
+            aside.unlink(missing_ok=True)
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a writable folder") from None
 
 
 def may_replace(path: Path) -> bool:

@@ -15,9 +15,9 @@ from typing import Any, Literal
 
 from abbe.service.config import LoadedMachine, parse_machine, text_of
 from abbe.service.domain.machine_file import FileEdit
+from abbe.service.domain.people import Permission
 from abbe.service.errors import ConfigError
 from abbe.service.toml_text import NotEditableError, edited
-from abbe.service.users.roles import Permission
 
 RIGHTS: Mapping[str, Permission] = MappingProxyType(
     {

@@ -34,7 +34,8 @@ from abbe.service.core.push_recovery import PushRecovery, push_is_open
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.core.table_watch import TableWatch
 from abbe.service.core.web_process import WebProcess
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.people import Permission
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import ConfigError
 from abbe.service.mqtt.publisher import Publisher, StoreOutbox
 from abbe.service.plant.gather import Gatherer
@@ -50,7 +51,6 @@ from abbe.service.sequences.recipes.campaigns import split_recipe_name
 from abbe.service.storage.engine import database_readable_by_others, parse_url
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
-from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.listening import bind, check_certificate, check_exposure
 

@@ -8,11 +8,10 @@ from pathlib import Path
 from typing import Any
 
 from abbe.models.effects.effect import Effect
-from abbe.public.estimates import Estimate
+from abbe.public.answers import Estimate
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, prepare, search
 from abbe.service.discovery.discover import discover as run_discovery
-from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.effect_pages import unit
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import ProgressSink, ignore_progress

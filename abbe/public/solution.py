@@ -14,8 +14,7 @@ from numpy.typing import ArrayLike
 from abbe.models.arrays import F2
 from abbe.models.compensation.nine_tables import nine_tables
 from abbe.models.compensation.tables import NineTables, quantise
-from abbe.public.estimates import Estimate
-from abbe.public.picture import Picture
+from abbe.public.answers import Estimate, Picture
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.domain.machine import Rules
 from abbe.service.errors import TableRefused

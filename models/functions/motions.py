@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 
 from abbe.models.arrays import F1, F2, F3
 from abbe.models.functions.axis_function import AxisFunction, axes_positions, interval
-from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.polynomial import straight_line
 from abbe.models.functions.table import Table
 from abbe.models.machine import AXES
 

@@ -3,6 +3,8 @@
 The mountings share the smooth terms, the lost motion, the bars' lengths and temperature and the laser's wavelength. Cup, mirror tilts, zero
 and drift belong to one mounting and are marginalised (Schur complement with their priors). The shared unknowns are expressed by independent
 ones of prior variance 1 (`PlanningProblem.root`), so the prior's information is the unit matrix.
+
+Poses of an artefact of unknown form share that form, so all poses are evaluated together (`pose_uncertainty_mm`).
 """
 
 from __future__ import annotations
@@ -19,7 +21,7 @@ from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import AXES, Machine
 from abbe.models.planning.measurements import BAR_VALUES, HelixTest, Instruments, Measurement, expected_run
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import bar_length_name, run_design, setup_unknowns
+from abbe.models.solvers.observe import LOST, bar_length_name, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors, size_model
 
 LASER_SCALE = "laser_scale"
@@ -149,3 +151,30 @@ def uncertainty_mm(information: F2, rows: F2, stated_mm2: F1 | float = 0.0) -> t
     half = scipy.linalg.solve_triangular(scipy.linalg.cholesky(information, lower=True), rows.T, lower=True)
     v = (half**2).sum(axis=0).reshape(-1, 3).sum(axis=1) + stated_mm2
     return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))
+
+
+def pose_uncertainty_mm(
+    what: PlanningProblem, runs: tuple[RunData, ...], points_mm: F2, noise_mm: float, n_axes: int
+) -> tuple[float, float]:
+    """Return the standard uncertainty of the deviation at points: at the worst point, and rms, mm.
+
+    The best-fit rigid motion is removed. ``n_axes``: 2, X and Y at points in a plane; 3, all axes. ``runs``: poses, and calibrated lengths
+    of the artefact; ``noise_mm``: per reading.
+    """
+    n_terms = len(what.terms)
+    setup = setup_unknowns(runs, what.priors, what.machine)
+    full = np.concatenate([run_design(what.machine, what.terms, r, setup) * np.sqrt(r.weight_n)[:, None] for r in runs]) / noise_mm
+    shared = full[:, : n_terms + LOST] @ what.root[: n_terms + LOST]
+    a = np.concatenate([shared, full[:, n_terms + LOST :] * setup.prior_sd], axis=1)
+    fields = design(what.machine, what.terms, points_mm)[:, :n_axes].reshape(n_axes * len(points_mm), -1)
+    rows = _without_motion(points_mm, fields, n_axes) @ what.root[:n_terms]
+    whole = np.concatenate([rows, np.zeros((len(rows), a.shape[1] - rows.shape[1]))], axis=1)
+    factor = scipy.linalg.cho_factor(a.T @ a + np.eye(a.shape[1]))
+    variance = np.einsum("ij,ji->i", whole, scipy.linalg.cho_solve(factor, whole.T)).reshape(-1, n_axes).sum(axis=1)
+    return float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
+
+
+def _without_motion(points_mm: F2, rows: F2, n_axes: int) -> F2:
+    motion = rigid_design(points_mm)[:, :n_axes]
+    basis, _ = np.linalg.qr((motion if n_axes == 3 else motion[:, :, [0, 1, 5]]).reshape(n_axes * len(points_mm), -1))
+    return np.asarray(rows - basis @ (basis.T @ rows))

@@ -2,6 +2,8 @@
 
 Each record holds the digest of the record before it, and a seal: the HMAC of its own digest with the key. A head is the id, digest and seal
 of a record. The file of heads has one line per record, so that removed records are noticed.
+
+`login` names the account of a command in records and journals.
 """
 
 from __future__ import annotations
@@ -20,8 +22,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import GENESIS, canonical
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AuditBroken
 from abbe.service.secrets import mask_secrets, visible
 from abbe.service.storage.engine import parse_url, private_file
@@ -394,13 +396,22 @@ def _anchor(line: str) -> Anchor | None:
     return None
 
 
+def login() -> str:
+    """The account that runs this command line."""
+    try:
+        return getpass.getuser()
+    except (KeyError, OSError):  # a service account without a name
+        return f"user {os.getuid()}"
+
+
+def by_whom() -> str:
+    """The account that orders a table from this command line, as the journal names it."""
+    return f"{login()}, by the command line"
+
+
 def this_account() -> str:
     """The operating system account of this process: ``os:NAME@HOST``."""
-    try:
-        name = getpass.getuser()
-    except (KeyError, OSError):
-        name = "?"
-    return f"os:{name}@{platform.node()}"
+    return f"os:{login()}@{platform.node()}"
 
 
 def _clean(text: str) -> str:

@@ -20,8 +20,8 @@ from pathlib import Path
 from abbe.service.audit.book import AuditBook, faults, heads_in, this_account
 from abbe.service.backup.pieces import PIECES, ListedPieces, check, cut
 from abbe.service.capture.settings import CaptureSettings, other_folders, segment_folder
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import document, record
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import BackupRefused, Unusable
 from abbe.service.files import is_plain, read_plain
 from abbe.service.secrets import mask_secrets

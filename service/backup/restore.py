@@ -14,7 +14,7 @@ from abbe.service.audit.book import AuditBook, files_of, sqlite_base, this_accou
 from abbe.service.backup.backup import CAPTURE, DATABASE, HEADS, KEY, Backup, BackupSource, audit_faults, read_backup, sqlite_file
 from abbe.service.backup.pieces import PIECES, join
 from abbe.service.capture.settings import segment_folder
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import BackupRefused
 from abbe.service.storage.copying import is_locked, processes_using, prove_copy, sync_file
 from abbe.service.storage.engine import known_revisions

@@ -29,10 +29,10 @@ from abbe.service.clock import Clock, SystemClock
 from abbe.service.devices.session import Session
 from abbe.service.domain.run import LaserSetup
 from abbe.service.errors import AbbeError, MeasurementFault
-from abbe.service.runs.recorder import Recorder
 from abbe.service.runs.sample_columns import MM_PER_COUNT
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.nc.blocks import LASER_DWELL_S
+from abbe.service.sequences.paths import Recorder
 from abbe.service.sequences.steps import CampaignPlan, MountLaser, MoveTo, ReadLaser, TestPlan, Unmount
 from abbe.service.site import Site
 from abbe.service.storage.store import Store

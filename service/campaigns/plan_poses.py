@@ -16,8 +16,7 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.planning.measurements import Instruments
-from abbe.models.planning.poses import pose_uncertainty_mm
-from abbe.models.planning.problem import PlanningProblem, problem
+from abbe.models.planning.problem import PlanningProblem, pose_uncertainty_mm, problem
 from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.models.solvers.observability.poses import SHIFT, PoseRank, pose_rank
 from abbe.models.solvers.observations import RunData

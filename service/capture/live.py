@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.drivers.api import BarBatch, Point, bar_is_valid, on_path
-from abbe.service.domain.bounds import WORD
+from abbe.service.domain.document import WORD
 from abbe.service.domain.progress import MachineReading, RecordedPath
 from abbe.service.domain.run import BarSetup
 from abbe.service.runs.coverage import about_axis, helix_axis

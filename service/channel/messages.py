@@ -20,11 +20,10 @@ from typing import Annotated, Literal, Self, TypeVar
 
 from pydantic import ConfigDict, Field, TypeAdapter, ValidationError
 
-from abbe.service.domain.bounds import Number, Text, Word
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.document import Number, Text, Word
 from abbe.service.domain.machine import MachineObject, Rules
 from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
-from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, JobState, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import ChannelBroken, mistakes
 

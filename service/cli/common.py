@@ -324,7 +324,7 @@ def answer_into(out: Path | None) -> Iterator[None]:
     if out is None:
         yield
         return
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.files import write_page
 
     text = io.StringIO()
     try:

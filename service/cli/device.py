@@ -83,7 +83,7 @@ def try_device(
     from abbe.service.cli.running import person_at_console
     from abbe.service.clock import SystemClock
     from abbe.service.errors import ConfigError
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.files import write_page
 
     if move and not 0.0 < tolerance < 0.2 * abs(move):
         raise ConfigError(f"--tolerance {tolerance:g} does not fit --move {move:g}", "give more than 0 and less than a fifth of the motion")

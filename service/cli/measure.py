@@ -326,10 +326,10 @@ async def ready_session(store: Store, site: Site, *, accept_table: bool = False,
     ``accept_table``: the person at the console vouches for a table in force that this database did not push. ``listening``: an operator
     moves the machine.
     """
+    from abbe.service.audit.book import by_whom
     from abbe.service.cli.running import person_at_console
     from abbe.service.compensation.recover import recovered_session
     from abbe.service.devices.session import lock_machine
-    from abbe.service.users.account import by_whom
 
     def report(text: str) -> None:
         typer.echo(text, err=True)
@@ -437,8 +437,8 @@ class Rehearsal:
 
     def run(self, site: Site, plan: CampaignPlan, runs: tuple[DryRun, ...], *, as_json: bool) -> None:
         """Print or draw the dry run, or write the NC program."""
+        from abbe.service.files import write_page
         from abbe.service.rendering.document_page import write_document
-        from abbe.service.rendering.page_file import write_page
         from abbe.service.report.dry_run_page import dry_run_report
         from abbe.service.sequences.nc.write import nc_program
 

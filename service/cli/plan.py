@@ -43,8 +43,8 @@ def plan(  # noqa: PLR0913 - one argument for each option
     from abbe.service.campaigns.plan import plan_doc, plan_for, plan_report, read_instruments
     from abbe.service.cli.running import display
     from abbe.service.config import load_machine
+    from abbe.service.files import write_page
     from abbe.service.rendering.document_page import write_document
-    from abbe.service.rendering.page_file import write_page
     from abbe.service.site import site_of
 
     site = site_of(load_machine(file).machine)
@@ -71,7 +71,7 @@ def _plan_poses(site: Site, artefact: Path, minutes: float, out: Path | None, *,
     from abbe.service.campaigns.plan_poses import HEADINGS as POSE_HEADINGS
     from abbe.service.campaigns.plan_poses import plan_poses, pose_doc, pose_rows, read_artefact
     from abbe.service.cli.running import display
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.files import write_page
 
     name, plate = read_artefact(artefact)
     with display() as sink:

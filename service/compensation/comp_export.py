@@ -25,13 +25,12 @@ from abbe.models.uncertainty.scales import SCALE_TEXTS, Scales, scale_projection
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.errors import FileFormatError, FormatRefused, SignatureRefused, TableFileError
-from abbe.service.files import NotPlainError, read_plain
+from abbe.service.files import NotPlainError, read_plain, write_page
 from abbe.service.formats.controls import CONTROLS, ControlModel, FormatChoice, best_of, choices, rounded
 from abbe.service.formats.files import FormatSettings, TextFile
 from abbe.service.formats.identified import Identified
 from abbe.service.formats.model import Compensation, negated
 from abbe.service.formats.registry import FORMATS, format_of
-from abbe.service.rendering.page_file import write_page
 from abbe.service.signed import keys
 from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
 from abbe.service.site import machine_from_doc, site_of

@@ -20,9 +20,9 @@ from abbe.drivers.opcua_control import open_files
 from abbe.service.clock import utc_text
 from abbe.service.compensation.comp_export import alike_mm, contents, control_for, read_files, read_key
 from abbe.service.errors import FileFormatError
+from abbe.service.files import write_page
 from abbe.service.formats.compare import check_same
 from abbe.service.formats.files import FormatSettings
-from abbe.service.rendering.page_file import write_page
 
 FORMAT = "abbe-drop/1"
 RECEIPT, BEFORE = "receipt.json", "before"

@@ -16,6 +16,7 @@ from typing import Any
 
 from abbe.drivers.api import TableController
 from abbe.models.compensation.tables import Predicted
+from abbe.service.audit.book import by_whom, login
 from abbe.service.campaigns.device_checks import check_devices
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import check_commissioned
@@ -25,8 +26,8 @@ from abbe.service.compensation.proposals import candidate_context, until_s
 from abbe.service.compensation.proved_levels import LevelStatus, check_level
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import Session
-from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.progress import ProgressSink, ignore_progress
+from abbe.service.domain.results import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
 from abbe.service.push.journal import Capabilities
 from abbe.service.push.operations import Approval
@@ -45,7 +46,6 @@ from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base
-from abbe.service.users.account import by_whom, login
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import datetime, timedelta
 
+from abbe.service.audit.book import login
 from abbe.service.clock import Clock, utc_text
 from abbe.service.compensation.proposal_doc import Proposed, load
-from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.push_entry import TERMINAL, PushState
+from abbe.service.domain.results import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
 from abbe.service.push.journal import Journal, facts
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
-from abbe.service.users.account import login
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,6 +24,7 @@ from abbe.models.compensation.plane import partial_tables
 from abbe.models.compensation.tables import NineTables, Predicted, quantise
 from abbe.models.machine import AXES
 from abbe.models.uncertainty.scales import SCALE_TEXTS
+from abbe.service.audit.book import login
 from abbe.service.campaign_data.campaign_folder import from_store
 from abbe.service.clock import Clock, SystemClock, utc_text
 from abbe.service.compensation.proposal_doc import BaseMark, Proposed, digest_of_doc, doc_of
@@ -41,7 +42,6 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, added, read_base, tables_from_image
 from abbe.service.tables.push_journal import JournalView
-from abbe.service.users.account import login
 
 SIGNER = "metrologist"
 MONTH = timedelta(days=30)

@@ -15,7 +15,7 @@ from abbe.service.compensation.gate import PushContext, admit
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import finish_when_safe, recovered_session, with_notes
 from abbe.service.devices.session import lock_machine
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableRefused, TakenBack
 from abbe.service.sequences.check import paced

@@ -14,12 +14,13 @@ from dataclasses import dataclass, field
 from abbe.drivers.api import TableController
 from abbe.drivers.errors import DriverError
 from abbe.drivers.tables import crc32
+from abbe.service.audit.book import by_whom
 from abbe.service.clock import Clock
 from abbe.service.compensation.commission import check_commissioned
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, RestoredTable
 from abbe.service.compensation.recover import LIMIT_S, finish_when_safe, recover, with_notes
 from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
 from abbe.service.push.journal import Journal, facts
@@ -30,7 +31,6 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.known_tables import unverified_crcs
 from abbe.service.tables.nine_tables import Base, read_base
 from abbe.service.tables.push_journal import KIND, STOPPED, JournalView, ended_as
-from abbe.service.users.account import by_whom
 
 
 @dataclass(frozen=True, slots=True)

@@ -17,7 +17,7 @@ from pathlib import Path
 from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.domain.bounds import TEXT, WORD
+from abbe.service.domain.document import TEXT, WORD
 from abbe.service.domain.progress import DeviceStatus, Progress, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import StoreError

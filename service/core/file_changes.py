@@ -19,11 +19,11 @@ from abbe.service.config import LoadedMachine, load_machine
 from abbe.service.core.jobs import MachineClaim
 from abbe.service.core.setup import MachineFileSource, ServiceSetup
 from abbe.service.devices.session import lock_machine
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.people import Permission
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AbbeError, ConfigError, MachineInUse
 from abbe.service.files import replace_file
 from abbe.service.machine_changes import RIGHTS, ValueChange, changed, differences, section_of
-from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.file")
 ACTION = "machine file"

@@ -19,14 +19,14 @@ import structlog
 
 from abbe.service.channel.messages import MOST_JOBS, Answer, ConfirmPrompt, Outcome, StartJob, SteerJob
 from abbe.service.clock import Clock
-from abbe.service.domain.bounds import TEXT, WORD
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.document import TEXT, WORD
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobState
 from abbe.service.domain.schedule import Schedule
 from abbe.service.scheduler.job import Job, carry_out
 from abbe.service.scheduler.ports import JobWatcher, SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import is_full, split_recipe_name
-from abbe.service.users.roles import Permission
 
 log = structlog.get_logger("abbe.jobs")
 

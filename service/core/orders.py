@@ -22,9 +22,9 @@ from abbe.service.compensation.proposal_decisions import proposal_status
 from abbe.service.compensation.proposal_doc import load
 from abbe.service.compensation.rollback import RollbackOrder, RollbackRequest
 from abbe.service.core.jobs import FullCampaigns, JobRegistry, JobRequest, by_hand, no_alarms
-from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.job_state import JobKind, JobOutcome
-from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.people import ALLOWED, Permission, Role
+from abbe.service.domain.progress import JobKind, JobOutcome, ProgressSink
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AbbeError, NotStored, TableRefused
 from abbe.service.scheduler.alarm_manager import AlarmManager
 from abbe.service.scheduler.job import Job, failure
@@ -34,7 +34,6 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.recipes.campaigns import is_full
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import STOPPED, JournalView, RollbackOffer, reconciled
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.verification.alarm_states import Alarm, Note
 
 log = structlog.get_logger("abbe.orders")

@@ -22,9 +22,8 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import DemoRun, bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import HiddenTruth, running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
-from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare, search
 from abbe.service.discovery.discovery_answer import location_doc
-from abbe.service.discovery.discovery_engine import search
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import book_lines, effect_lines, next_of, verdict_of
 from abbe.service.discovery.new_measurement import NewMeasurement, validate_on

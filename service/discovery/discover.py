@@ -1,7 +1,7 @@
 """The discovery workflow: fit, suspect, propose, test, explain or leave unexplained. It is stored and resumes where it was stopped.
 
-The search itself is one pure computation that takes seconds (`abbe.models.discovery.discover`). The journal stores the finding with the
-first state that follows from it, so that nothing is computed twice. It stores the new model version with the last state.
+The search itself (`search`) is one pure computation that takes seconds (`abbe.models.discovery.discover`). The journal stores the finding
+with the first state that follows from it, so that nothing is computed twice. It stores the new model version with the last state.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ from abbe.service.campaign_data.campaign_checks import check_files, check_readin
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.campaign_data.decimation import lines_of, thinned, thinning
 from abbe.service.campaign_data.provenance import code_digest, machine_digest, run_digest, versions, whole_run_digest
+from abbe.service.clock import SystemClock
 from abbe.service.discovery.changed_since import ReferenceSolution
 from abbe.service.discovery.discovery_states import ENDS, FOLLOWS, after_fit, entering
 from abbe.service.discovery.finding import finding_of
@@ -26,9 +27,9 @@ from abbe.service.domain.discovery import DiscoveryStep, FindingSource, SearchSt
 from abbe.service.domain.discovery_file import FoundThinning
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.model_book import ModelBook, ModelVersion
-from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
-from abbe.service.effects.axis_test import SLOW_DRIFT
+from abbe.service.effects.axis_test import SLOW_DRIFT, is_axis_test
 from abbe.service.effects.effect_sums import readings_of, without
 from abbe.service.effects.model_book import applies, extended_book
 from abbe.service.errors import NotObservable
@@ -247,3 +248,23 @@ def _enters(step: DiscoveryStep, finding: Finding) -> bool:
 def _version(job: DiscoveryJob, journal: DiscoveryJournal, finding: Finding) -> ModelBook:
     """Return the model book, extended by those effects of a proved finding that shift readings."""
     return extended_book(job.base, replace(finding, effects=entering(finding)), job.source, journal.id, job.effects)
+
+
+def search(case: Case, effects: tuple[Effect, ...], sink: ProgressSink) -> Discovery:
+    """Find effects that a case's model lacks (`abbe.models.discovery.discover`), and report progress and remaining time to ``sink``.
+
+    A positioning test of one axis is first searched for a drift of its repeats (`abbe.service.discovery.axis_search`).
+    """
+    from abbe.models.discovery.discover import discover
+    from abbe.service.discovery.axis_search import axis_discovery
+
+    clock = SystemClock()
+    begun = clock.monotonic_s()
+
+    def report(text: str, share: float) -> None:
+        spent = clock.monotonic_s() - begun
+        sink(Progress("discover", share, 1.0, spent * (1.0 - share) / share if share > 0.0 else None, text))
+
+    found = (axis_discovery if is_axis_test(case) else discover)(case, effects, progress=report)
+    sink(Progress("discover", 1.0, 1.0, 0.0, "done"))
+    return found

@@ -6,9 +6,8 @@ import math
 
 from abbe.models.discovery.answer import Localization, NextTest
 from abbe.service.discovery.changed_text import changed_lines
-from abbe.service.discovery.discovery_states import LEFT, entering, judge, not_entered
+from abbe.service.discovery.discovery_states import LEFT, disagreeing, entering, judge, not_entered, nothing_missing
 from abbe.service.discovery.effect_pages import ADDS, unit
-from abbe.service.discovery.never_fitted import disagreeing, nothing_missing
 from abbe.service.domain.discovery import Judgement
 from abbe.service.domain.finding import EffectFound, EffectSize, Finding, GapUm, ParameterFound
 from abbe.service.effects.model_book import REMEDIES

@@ -1,12 +1,12 @@
-"""Documents: JSON as it is stored or sent, parsed into a record once, where it is read."""
+"""Documents: JSON as it is stored or sent, within limits, parsed into a record once, where it is read."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Annotated, Any, TypeVar
 
-from pydantic import TypeAdapter, ValidationError
+from pydantic import Field, TypeAdapter, ValidationError
 
 from abbe.service.errors import Unusable, mistakes
 
@@ -15,6 +15,11 @@ Doc = dict[str, Any]
 GENESIS = "0" * 64
 """Stands for the digest of the previous entry in the first entry of a hash chain."""
 T = TypeVar("T")
+WORD, TEXT = 200, 4000
+"""Longest texts: the channel between the two processes refuses longer ones and larger numbers (`Number`)."""
+Word = Annotated[str, Field(max_length=WORD)]
+Text = Annotated[str, Field(max_length=TEXT)]
+Number = Annotated[int, Field(ge=0, le=2**62)]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from abbe.service.domain.bounds import Number, Text, Word
+from abbe.service.domain.document import Number, Text, Word
 
 Origin = Literal["default", "file", "environment"]
 MOST_VALUES = 5000

@@ -13,7 +13,7 @@ from zoneinfo import ZoneInfo
 from cronsim import CronSim, CronSimError
 from pydantic import AfterValidator, AwareDatetime, Field
 
-from abbe.service.domain.bounds import WORD
+from abbe.service.domain.document import WORD
 
 FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
 """Instant from which intervals are counted, unless the machine file names another."""

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from xml.parsers import expat
 
-from abbe.service.domain.imported_file import StatedFigure
+from abbe.service.domain.run_file import StatedFigure
 from abbe.service.errors import FileFormatError
 from abbe.service.formats.files import TextFile
 from abbe.service.instrument_files.content import Content, digest

@@ -11,9 +11,8 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.domain.document import Doc
-from abbe.service.domain.imported_file import SourceFile
 from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
-from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile
+from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, SourceFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.answers import LENGTHS, Answers, laser_of, settled, unknown_of
 from abbe.service.instrument_files.content import AxisReadings, Content, Trace

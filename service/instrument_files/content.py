@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.service.domain.imported_file import StatedFigure
+from abbe.service.domain.run_file import StatedFigure
 from abbe.service.errors import FileFormatError
 from abbe.service.files import NotPlainError, read_plain
 from abbe.service.formats.files import NUMBER, TextFile

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from abbe.service.domain.imported_file import SourceFile
+from abbe.service.domain.run_file import SourceFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.ballbar import read_b5r
 from abbe.service.instrument_files.columns import ColumnFile, guesses, read_table, table_of

@@ -18,7 +18,7 @@ from abbe.service.campaigns.resume import resume as resume_campaign
 from abbe.service.compensation.gate import check_promise
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import Session, lock_machine
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import PreconditionsChanged, TableMismatch, TableRefused
 from abbe.service.jobs.interrupted import interrupted_campaign

@@ -24,8 +24,7 @@ from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.discovery.changed_since import reference_solution
 from abbe.service.discovery.changed_text import changed_text
-from abbe.service.discovery.discover import discover, prepare
-from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.discover import discover, prepare, search
 from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import size_text, verdict_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, fields
 
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.store import Store
 
 

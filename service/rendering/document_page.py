@@ -16,12 +16,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
 
 from abbe.service.errors import FileFormatError
+from abbe.service.files import write_page
 from abbe.service.rendering.aqdef import document_dfq
 from abbe.service.rendering.certificate import document_dcc
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_data import document_csv, document_json, shown
 from abbe.service.rendering.numbers import printable
-from abbe.service.rendering.page_file import write_page
 from abbe.service.rendering.palette import paper_rules, style_rules
 from abbe.service.rendering.phrases import ENGLISH, LANGUAGES, phrase
 from abbe.service.rendering.qif import document_qif

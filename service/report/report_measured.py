@@ -16,9 +16,9 @@ from abbe.models.solvers.observations import nominal_reading
 from abbe.models.verification import helix_figure
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.domain.document import Doc
-from abbe.service.domain.imported_file import OtherReadings, SourceFile, StatedFigure
 from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run
+from abbe.service.domain.run_file import OtherReadings, SourceFile, StatedFigure
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.domain.verification import Verdict
 from abbe.service.errors import AbbeError, MeasurementFault

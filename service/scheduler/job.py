@@ -16,8 +16,7 @@ import structlog
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
-from abbe.service.domain.job_state import JobKind, JobOutcome
-from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.progress import JobKind, JobOutcome, Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, Stopped
 from abbe.service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState

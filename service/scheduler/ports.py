@@ -6,8 +6,7 @@ from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
 from typing import Any, NamedTuple, Protocol, Self
 
-from abbe.service.domain.job_state import JobOutcome
-from abbe.service.domain.progress import Progress, ProgressSink
+from abbe.service.domain.progress import JobOutcome, Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.verification import CheckResult
 from abbe.service.sequences.control import Control

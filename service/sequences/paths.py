@@ -8,16 +8,37 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from contextlib import asynccontextmanager
+from typing import Any, Protocol
 
-from abbe.drivers.api import BarBatch, Condition, ControllerStatus, Motion, Paths, bar_is_out, bar_is_valid, on_path
+from abbe.drivers.api import BarBatch, BarTap, Condition, ControllerStatus, Motion, Paths, bar_is_out, bar_is_valid, on_path
 from abbe.drivers.errors import DriverError, run_to_end
 from abbe.service.devices.session import Session
 from abbe.service.errors import AbbeError, BarOutOfRange, MeasurementFault, RunInterrupted
-from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.control import Control, check_interlocks
 from abbe.service.sequences.resume_plan import PathProgress, PathRemainder, StretchComparison
 from abbe.service.sequences.steps import FollowPath, RecordPath
 from abbe.service.sequences.watch import first_of
+
+
+class Recorder(Protocol):
+    """Receives and stores the data of one run."""
+
+    def tap(self) -> BarTap:
+        """Return the receiver of every sample of a new stream."""
+        ...
+
+    async def add_bar(self, batch: BarBatch) -> None:
+        """Account for a batch that the tap received; raises if its samples are not safe, so that the motion stops."""
+        ...
+
+    async def flush(self) -> None:
+        """Wait until all data received so far are on the disk."""
+        ...
+
+    async def add_record(self, record: dict[str, Any]) -> None:
+        """Store one record of the laser, or of another instrument with single readings."""
+        ...
+
 
 STOP_S = 10.0
 """Longest time for a stop, s. The driver gives up earlier: it waits seconds for each write, and five until the axes stand."""

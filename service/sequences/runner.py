@@ -13,11 +13,10 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.document import parsed
 from abbe.service.domain.measured import LaserRecord, TouchRecord
 from abbe.service.errors import BeamLost, MeasurementFault, RunInterrupted, SetupDisturbed
-from abbe.service.runs.recorder import Recorder
 from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import AT_WORK, PAUSED, Control, ExpectedTable, Watching, check_interlocks, check_ours
 from abbe.service.sequences.journal import HAND, POINT, Journal, NoJournal
-from abbe.service.sequences.paths import bar_trouble, follow_path, motion_interlock, record_path
+from abbe.service.sequences.paths import Recorder, bar_trouble, follow_path, motion_interlock, record_path
 from abbe.service.sequences.probing import FeatureTouch, check_same, guarded_move, need_probe
 from abbe.service.sequences.resume_plan import BY_HAND, OFF_PATH_MM, REFERENCE_MM, Attempt, PathProgress, PathRemainder, way_back
 from abbe.service.sequences.steps import (

@@ -21,8 +21,7 @@ from sqlalchemy.dialects.sqlite import Insert as SqliteInsert
 from sqlalchemy.dialects.sqlite import insert as sqlite_insert
 
 from abbe.service.clock import utc_text
-from abbe.service.domain import decisions, measured, people, push_entry, results, service_records
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain import measured, people, push_entry, results, service_records
 from abbe.service.domain.document import document
 from abbe.service.domain.document import record as parse_record
 from abbe.service.domain.measured import Owner
@@ -251,9 +250,9 @@ DISCOVERY = RecordMapping(results.DiscoveryRecord, t.discoveries)
 STEP = RecordMapping(results.StepRecord, t.discovery_steps)
 MODEL = RecordMapping(results.ModelRecord, t.machine_models)
 
-PROPOSAL = RecordMapping(decisions.ProposalRecord, t.proposals)
-APPROVAL = RecordMapping(decisions.ProposalApproval, t.approvals)
-REJECTION = RecordMapping(decisions.ProposalRejection, t.rejections)
+PROPOSAL = RecordMapping(results.ProposalRecord, t.proposals)
+APPROVAL = RecordMapping(results.ProposalApproval, t.approvals)
+REJECTION = RecordMapping(results.ProposalRejection, t.rejections)
 PUSH_ENTRY = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id)
 PUSH_MARK = RecordMapping(push_entry.PushEntry, t.push_entries, number=t.push_entries.c.id, doc=null())
 """A push entry without its document, which holds the images of tables."""
@@ -267,7 +266,7 @@ REPLY = RecordMapping(service_records.ReplyRecord, t.replies)
 USER = RecordMapping(people.UserRecord, t.users)
 SESSION = RecordMapping(people.SessionRecord, t.sessions)
 TOKEN = RecordMapping(people.TokenRecord, t.api_tokens)
-AUDIT = RecordMapping(AuditEvent, t.audit)
+AUDIT = RecordMapping(service_records.AuditEvent, t.audit)
 
 Order = ColumnElement[Any]
 

@@ -11,7 +11,7 @@ from datetime import datetime
 from functools import cached_property
 from typing import Any, Literal
 
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.push_entry import BEFORE_ACTIVATION, TERMINAL, PushEntry, PushState
 from abbe.service.errors import JournalChanged, TableMismatch, TableRefused
 from abbe.service.push.journal import NO_PUSH, NOT_YET, Journal, JournalBroken, PushFacts, check_chain, facts

@@ -21,10 +21,9 @@ from argon2 import PasswordHasher
 from argon2.exceptions import InvalidHashError, VerifyMismatchError
 
 from abbe.service.clock import Clock, utc_text
-from abbe.service.domain.people import TokenRecord, UserRecord
+from abbe.service.domain.people import ALLOWED, Permission, Role, TokenRecord, UserRecord
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import ALLOWED, Permission, Role
 
 AT_A_TIME = 2
 """Concurrent hashes. Each takes 19 MiB and a processor for tens of milliseconds: many logins must not starve the capture."""

@@ -15,12 +15,12 @@ from starlette.staticfiles import StaticFiles
 from starlette.types import ASGIApp
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.people import Permission
 from abbe.service.plant.gather import FactsSource, Gatherer
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import Status, StatusSource
 from abbe.service.rendering.phrases import phrase
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import Permission
 from abbe.service.web import problems
 from abbe.service.web.api.measured import add_measured, add_plant
 from abbe.service.web.api.results import add_reports, add_results

@@ -16,9 +16,9 @@ from starlette.requests import HTTPConnection
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from abbe.service.domain.document import Doc
+from abbe.service.domain.people import Permission
 from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.status import Status
-from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current, frame_for
 from abbe.service.web.problems import MEDIA_TYPE, problem, problem_of
 from abbe.service.web.strip import strip_of

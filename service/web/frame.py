@@ -14,8 +14,8 @@ from starlette.requests import HTTPConnection
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from abbe.service.domain.people import Permission
 from abbe.service.rendering.numbers import Unit
-from abbe.service.users.roles import Permission
 from abbe.service.web import language, units
 from abbe.service.web.language import DEFAULT, NAMES
 from abbe.service.web.login.auth_middleware import Visit

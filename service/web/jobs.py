@@ -9,11 +9,11 @@ from fastapi import FastAPI, Header, HTTPException, Path, Request
 from fastapi.responses import JSONResponse, Response
 
 from abbe.service.channel.messages import Answer, Steering
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobState
 from abbe.service.queries.reader import json_value
 from abbe.service.rendering.phrases import phrase
 from abbe.service.sequences.recipes.campaigns import named, split_recipe_name
-from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.formatting import without_commands
 from abbe.service.web.frame import current

@@ -10,11 +10,11 @@ from dataclasses import replace
 from fastapi import FastAPI, WebSocket, WebSocketDisconnect
 from pydantic import TypeAdapter
 
+from abbe.service.domain.people import Permission
 from abbe.service.domain.progress import RunningCheck
 from abbe.service.errors import CoreUnavailable
 from abbe.service.queries.status import LiveEvent
 from abbe.service.rendering.phrases import phrase
-from abbe.service.users.roles import Permission
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.frame import language_of
 from abbe.service.web.login.access import needs

@@ -13,9 +13,9 @@ from prometheus_client.process_collector import ProcessCollector
 from prometheus_client.registry import Collector
 
 from abbe.service.channel.messages import Snapshot
+from abbe.service.domain.people import Permission
 from abbe.service.errors import CoreUnavailable
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import Permission
 from abbe.service.verification.verified_by import verified_by
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.login.access import needs

@@ -7,9 +7,9 @@ from collections.abc import Callable, Mapping
 from fastapi import FastAPI, Request
 from fastapi.responses import Response
 
+from abbe.service.domain.people import Permission
 from abbe.service.plant.gather import FactsSource, PlantFacts
 from abbe.service.plant.mtconnect import Agent, MtconnectRefusal
-from abbe.service.users.roles import Permission
 from abbe.service.web.login.access import needs
 
 MEDIA_TYPE = "text/xml"

@@ -7,11 +7,10 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.bounds import WORD
-from abbe.service.domain.job_state import JobState
-from abbe.service.domain.progress import DeviceStatus
+from abbe.service.domain.document import WORD
+from abbe.service.domain.progress import DeviceStatus, JobState
 from abbe.service.domain.push_entry import PushTransition
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.domain.verification import Verification
 from abbe.service.queries.measured import CampaignSummary, MachineDescription, RunSummary
 from abbe.service.queries.people import UserSummary

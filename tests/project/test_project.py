@@ -17,7 +17,7 @@ from setuptools.discovery import PEP420PackageFinder
 from abbe.service.audit.book import AuditBook, files_of, sqlite_base
 from abbe.service.backup.restore import SQLITE_SUFFIXES
 from abbe.service.capture.settings import CaptureSettings, segment_folder
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.engine import known_revisions
 from abbe.service.storage.store import Store
 

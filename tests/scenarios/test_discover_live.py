@@ -45,7 +45,7 @@ def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, mo
     sims = start_sims("--speed", "60")
     assert run("measure", "-m", sims.machine_file, "--helix", "300,250,100,60", "--name", "june")[0] == 0
     search = Asks()
-    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
+    monkeypatch.setattr("abbe.service.discovery.discover.search", search)
     code, out, err = run("discover", "june", "--machine", sims.machine_file, "--live", "--report", "live.html")
     assert code == 0, err
     assert out.count("measure next: the same path at a second feed") == 1
@@ -102,7 +102,7 @@ def test_killed_while_it_measures_the_same_command_goes_on(run, start_sims, monk
     assert added() == [("n1-feed", "incomplete", True)]
     wait_for(lambda: axes_at_rest(sims), 60, "the controller has run its path to the end")
     search = Asks()
-    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
+    monkeypatch.setattr("abbe.service.discovery.discover.search", search)
     for again in (False, True):
         code, out, err = run("discover", "june", "--machine", sims.machine_file, "--live")
         assert code == 0, err

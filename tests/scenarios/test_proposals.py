@@ -14,6 +14,7 @@ from typing import Any
 
 import pytest
 
+from abbe.service.audit.book import login
 from abbe.service.cli import run
 from abbe.service.clock import SystemClock
 from abbe.service.compensation.approved import ApprovedProposal, PushOrder, next_approved
@@ -25,15 +26,14 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.push_approved import push_approved
 from abbe.service.config import load_machine
 from abbe.service.devices.session import DeviceUrls, open_session
-from abbe.service.domain.decisions import ProposalApproval
 from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.results import ProposalApproval
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import StoreError, TableRefused
 from abbe.service.sequences.control import Control, Watching
 from abbe.service.site import Site, site_of
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
-from abbe.service.users.account import login
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import registers

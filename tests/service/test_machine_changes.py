@@ -10,10 +10,10 @@ import pytest
 from abbe.service.config import LoadedMachine, parse_machine
 from abbe.service.config_schema import Calibration, Limits, Verify
 from abbe.service.domain.machine_file import FileEdit
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.errors import ConfigError
 from abbe.service.machine_changes import LOOSER, RIGHTS, changed, differences, is_looser
-from abbe.service.users.roles import ALLOWED, Permission, Role
 
 PATH = Path("machine.toml")
 TEXT = """name = "mill"

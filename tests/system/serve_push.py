@@ -21,8 +21,7 @@ from abbe.service.config_schema import Web
 from abbe.service.core.push_recovery import recover_at_start
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.session import DeviceUrls, Session, lock_machine, open_session
-from abbe.service.domain.job_state import JobOutcome
-from abbe.service.domain.progress import Progress
+from abbe.service.domain.progress import JobOutcome, Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.logs import configure_logs
 from abbe.service.mqtt.broker import Topics

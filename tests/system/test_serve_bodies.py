@@ -19,7 +19,7 @@ import pytest
 
 from abbe.service.config_schema import Web
 from abbe.service.core.web_process import OOM_SCORE_ADJ
-from abbe.service.users.roles import Role
+from abbe.service.domain.people import Role
 from tests.system.test_serve_processes import YEARLY, Running, bench, ended
 
 GIGABYTE, PIECE_B, GROWTH_KB = 1 << 30, 1 << 18, 8 * 1024

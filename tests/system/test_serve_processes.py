@@ -21,9 +21,9 @@ from websockets.sync.client import ClientConnection, connect
 from abbe.service.audit.book import AuditBook
 from abbe.service.capture.ledger import ledger_of, streams_from_end_doc
 from abbe.service.clock import SystemClock
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.storage.store import Store
 from abbe.service.users.people import UserAccounts
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.system.serve_bench import Machine, Process, abbe, free_port, service
 from tests.system.test_serve_stop import slots_of
 

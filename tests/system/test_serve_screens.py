@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, BrowserContext, ConsoleMessage, Page, Route
 
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.web.page import has_uplot
 from tests.pages_world import PHRASE, PROPOSER, Filled, Served, fill, filled_once, screens, served
 from tests.system.test_serve_page import ARTIFACTS

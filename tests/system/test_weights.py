@@ -11,8 +11,7 @@ from typing import Any
 import pytest
 from playwright.sync_api import Browser, Page
 
-from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.service_records import AlarmFacts, AlarmKind
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind, AuditEvent
 from abbe.service.storage.store import Store
 from tests.built_once import once_per_run
 from tests.pages_world import Filled, Served, fill, screens, served

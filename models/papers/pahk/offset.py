@@ -13,7 +13,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.polynomial import straight_line
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import lever_masks
 from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, parameter_signs

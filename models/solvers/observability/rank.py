@@ -1,4 +1,5 @@
-"""Observed information of a campaign: rank and hidden combinations of the coefficients, and status of every parameter and error motion.
+"""Observed information of a campaign: rank and hidden combinations of the coefficients, status of every parameter and error motion, and
+how strongly each run shows a motion.
 
 Convention: columns of unit length, unknown set-up errors projected out, singular values counted down to 1e-9 (rank) and 1e-3 (effective
 rank) of the largest. Priors are not used, because typical sizes are not measured. Measured or certified knowledge of the set-up
@@ -26,7 +27,8 @@ from abbe.models.machine import Machine
 from abbe.models.solvers.designs import unit_columns
 from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, HIDDEN, RANK_TOLERANCE, project_out, svd, taking_part
 from abbe.models.solvers.observations import RunData
-from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, straight_line_of
+from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, setup_unknowns, straight_line_of
+from abbe.models.solvers.priors import Priors
 
 BAR_TRAVEL_MM = 1.0
 """Measuring range of a usual ball-bar to either side of its nominal length."""
@@ -391,3 +393,41 @@ def observable_motions(found: tuple[MotionStatus, ...], *, weak: bool = False) -
     10 %). Other motions may still be corrected where only the sum of all motions matters: in a grid of the volume for the measured tool.
     """
     return tuple(m.name for m in found if m.status == "observed" or (weak and m.status == "weak"))
+
+
+LOST = 3
+NODES = 41
+ROUNDING = 1e-9
+
+
+def run_sensitivity(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...]) -> tuple[tuple[str, ...], F2]:
+    """Rms change of the readings of each run per unit rms of each motion over its stroke, mean over the motion's shapes.
+
+    The part that unknowns of the set-up (cup, bar, mirror, drift) absorb is removed; the part that other motions could explain stays.
+
+    Returns
+    -------
+    motions : tuple of str
+        Names in the order of the terms.
+    sensitivity : array (runs, motions)
+        mm per mm, or mm per rad for rotations and squareness.
+    """
+    nodes = np.stack([np.linspace(lo, hi, NODES) for lo, hi in machine.stroke_mm], axis=1)
+    values = term_values(terms, nodes, machine.stroke_mm)
+    names = tuple(dict.fromkeys(t.motion for t in terms))
+    setup = setup_unknowns(runs, Priors(), machine)
+    out = np.zeros((len(runs), len(names)))
+    for i, run in enumerate(runs):
+        rows = run_design(machine, terms, run, setup)
+        own, _ = unit_columns(rows[:, len(terms) + LOST :])
+        left, size, _ = np.linalg.svd(own, full_matrices=False)
+        taken = left[:, size > ROUNDING]
+        rest = rows[:, : len(terms)]
+        rest = rest - taken @ (taken.T @ rest)
+        for k, name in enumerate(names):
+            at = [j for j, t in enumerate(terms) if t.motion == name]
+            basis = values[:, at] if terms[at[0]].order else np.ones((1, 1))
+            mean_square = basis.T @ basis / len(basis)
+            power = np.trace(np.linalg.solve(mean_square, rest[:, at].T @ rest[:, at]))
+            out[i, k] = np.sqrt(max(float(power), 0.0) / (len(rest) * len(at)))
+    return names, out

@@ -27,7 +27,7 @@ from abbe.service.cli.common import (
 )
 
 if TYPE_CHECKING:
-    from abbe.service.domain.audit_event import AuditEvent
+    from abbe.service.domain.service_records import AuditEvent
 
 
 audit = typer.Typer(help="The audit: who did what, when, on what, and how it ended.", no_args_is_help=True)
@@ -299,7 +299,7 @@ def _missing(url: str) -> Path | None:
 def event_of(command: str, given: Mapping[str, Any], outcome: str) -> AuditEvent:
     """Return the record of a command: who ran it here, on what, with which options."""
     from abbe.service.audit.book import this_account
-    from abbe.service.domain.audit_event import AuditEvent
+    from abbe.service.domain.service_records import AuditEvent
 
     target = next((str(given[key]) for key in ("name", "campaign", "file", "out", "folder", "solution", "machine") if given.get(key)), "")
     options = {key: str(value) for key, value in given.items() if value not in (None, False, "", []) and key not in {"db", "as_json"}}

@@ -53,8 +53,8 @@ def acknowledge(
     as_json: JsonOption = False,
 ) -> None:
     """Note that a person has seen an alarm. The alarm stays active until a check clears it."""
+    from abbe.service.audit.book import login
     from abbe.service.config import load_machine
-    from abbe.service.users.account import login
     from abbe.service.verification.alarms import acknowledge as work
 
     loaded = load_machine(machine_file(machine))

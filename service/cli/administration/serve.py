@@ -22,8 +22,7 @@ if TYPE_CHECKING:
     from abbe.service.config_schema import AlarmSection, OpcUa, Web
     from abbe.service.core.orders import CampaignOrder, MeasureCampaign, OrderActions
     from abbe.service.core.setup import ServiceSetup
-    from abbe.service.domain.job_state import JobOutcome
-    from abbe.service.domain.progress import ProgressSink
+    from abbe.service.domain.progress import JobOutcome, ProgressSink
     from abbe.service.domain.verification import CheckResult
     from abbe.service.mqtt.broker import Broker
     from abbe.service.scheduler.alarm_manager import Duties
@@ -237,7 +236,7 @@ def campaign_on(site: Site, folder: Path, live: LiveFeed | None = None) -> Calla
     ``folder``: folder of the recipe files.
     """
     from abbe.service.clock import SystemClock
-    from abbe.service.domain.job_state import JobOutcome
+    from abbe.service.domain.progress import JobOutcome
     from abbe.service.sequences.recipes.campaigns import campaign_source
 
     def on(store: Store) -> MeasureCampaign:

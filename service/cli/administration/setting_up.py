@@ -56,8 +56,8 @@ def init(  # noqa: PLR0913 - one option for each question
     """
     from abbe.service.config import load_machine
     from abbe.service.domain.machine import DeviceUrls
+    from abbe.service.files import write_page
     from abbe.service.machine_text import machine_text
-    from abbe.service.rendering.page_file import write_page
 
     if file.exists():
         raise ConfigError(f"{file} exists", "give the name of a new file, or edit the existing one")

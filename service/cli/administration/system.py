@@ -89,7 +89,7 @@ def _write_machine_file(line: bytes, file: Path, *, as_json: bool) -> None:
     from abbe.service.clock import SystemClock
     from abbe.service.demo.demo import demo_site, machine_file_of
     from abbe.service.demo.simulator_process import SimulatorProcess
-    from abbe.service.rendering.page_file import write_page
+    from abbe.service.files import write_page
 
     if not line.strip():
         return

@@ -215,7 +215,7 @@ def _searched(job: DiscoveryJob, journal: DiscoveryJournal) -> Finding:
     """Return the finding, with progress on stderr; Ctrl-C reports what is kept."""
     from abbe.service.cli.running import display
     from abbe.service.discovery.discover import discover as work
-    from abbe.service.discovery.discovery_engine import search
+    from abbe.service.discovery.discover import search
 
     with display() as sink:
         try:

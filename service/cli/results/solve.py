@@ -231,8 +231,8 @@ def _more(summary: Assessment, wanted: _SolveRequest, report_stage: Callable[[st
     out: dict[str, Any] = {}
     if not (wanted.tables or wanted.grid or wanted.trials or wanted.out):
         return out
+    from abbe.service.files import write_page
     from abbe.service.identification.solve_tables import deviation_text, grid_text, machine_grid, monte_carlo, scale_free, table_rows
-    from abbe.service.rendering.page_file import write_page
 
     whole, summary = summary, scale_free(summary) if wanted.without_scale else summary
 

@@ -43,12 +43,12 @@ def drop(  # noqa: PLR0913 - one argument for each option
     if sum((to is not None, back is not None, seen, take_back)) != 1 or (to is None) != (form is None):
         raise FormatRefused("give one of --to PLACE --format F, --back PATH, --seen, --take-back", "abbe comp drop --help")
 
+    from abbe.service.audit.book import by_whom
     from abbe.service.clock import SystemClock
     from abbe.service.compensation import file_drop
     from abbe.service.compensation.comp_export import control_for, reference_of, settings_for, sign_is_turned
     from abbe.service.config import load_machine
     from abbe.service.site import site_of
-    from abbe.service.users.account import by_whom
 
     site = site_of(load_machine(machine_file(machine)).machine)
     if to is not None and form is not None:

@@ -196,11 +196,11 @@ def approve(
     with open_store(database_url(db, machine)) as store:
         store.proposals.get(proposal)
 
+        from abbe.service.audit.book import login
         from abbe.service.clock import SystemClock
         from abbe.service.compensation.proposal_decisions import approve as work_approve
         from abbe.service.errors import TableRefused
         from abbe.service.tables.push_journal import open_pushes
-        from abbe.service.users.account import login
 
         try:
             done = work_approve(store, proposal, name.strip() or login(), hours, SystemClock())
@@ -239,11 +239,11 @@ def reject(
     with open_store(database_url(db, machine)) as store:
         store.proposals.get(proposal)
 
+        from abbe.service.audit.book import login
         from abbe.service.clock import SystemClock
         from abbe.service.compensation.proposal_decisions import reject as work_reject
         from abbe.service.errors import TableRefused
         from abbe.service.queries import tables
-        from abbe.service.users.account import login
 
         try:
             done = work_reject(store, proposal, name.strip() or login(), reason, SystemClock())

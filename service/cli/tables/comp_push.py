@@ -142,12 +142,12 @@ def accept_table(
     if not yes:
         raise ConfigError("nothing was accepted", "look at the controller's active table, then add --yes")
 
+    from abbe.service.audit.book import by_whom
     from abbe.service.compensation.recover import accept
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls, open_session
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
-    from abbe.service.users.account import by_whom
     from abbe.service.verification.verified_by import measure_now
 
     loaded = load_machine(machine_file(machine))

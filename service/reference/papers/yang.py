@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F2
-from abbe.models.functions.line_fit import slope_through_origin, straight_line
+from abbe.models.functions.polynomial import slope_through_origin, straight_line
 from abbe.models.notation.yang import YangErrors, iso_squareness, workpiece_mm
 from abbe.models.papers.yang.complete import delta_exact, reading_eq6, second_order_bound_mm
 from abbe.models.papers.yang.difference import confidence_interval

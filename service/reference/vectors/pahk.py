@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.polynomial import straight_line
 from abbe.models.notation.pahk import PahkType, motions_from_pahk, pahk_machine, pahk_type
 from abbe.models.papers.pahk.diagonals import space_diagonals
 from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, refer_to_origin

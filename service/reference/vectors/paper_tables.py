@@ -8,7 +8,7 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.functions.line_fit import slope_through_origin, straight_line
+from abbe.models.functions.polynomial import slope_through_origin, straight_line
 from abbe.models.papers.pahk.diagonals import squareness_diagonals_mm
 from abbe.service.reference.vector_checks import Checks
 from abbe.service.reference.vector_file import VectorCase

@@ -13,13 +13,15 @@ from typing import Any
 from sqlalchemy import Connection, func, select
 from sqlalchemy.exc import IntegrityError
 
-from abbe.service.domain.decisions import ProposalApproval, ProposalRecord, ProposalRejection
 from abbe.service.domain.document import Doc
 from abbe.service.domain.push_entry import PushEntry
 from abbe.service.domain.results import (
     DiscoveryRecord,
     ModelRecord,
     NewVersion,
+    ProposalApproval,
+    ProposalRecord,
+    ProposalRejection,
     SolutionRecord,
     StepRecord,
     TableRecord,

@@ -15,13 +15,13 @@ from sqlalchemy import ColumnElement, Connection, delete, func, or_, select, tex
 from sqlalchemy.exc import IntegrityError
 
 from abbe.service.clock import utc_text
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.document import Doc
 from abbe.service.domain.measured import Owner, this_process
 from abbe.service.domain.service_records import (
     AlarmEntryRecord,
     AlarmFacts,
     AlarmKind,
+    AuditEvent,
     HeartbeatRecord,
     OutboxRecord,
     ReplyRecord,

@@ -7,11 +7,11 @@ from typing import Annotated, Any
 from fastapi import FastAPI, Query
 from fastapi.responses import Response
 
+from abbe.service.domain.people import Permission
 from abbe.service.queries import measured
 from abbe.service.queries.timetable import schedule_state
 from abbe.service.sequences.recipes.campaigns import RECIPES
 from abbe.service.storage.repositories.pages import LARGEST
-from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
 from abbe.service.web.catalogue import entries
 from abbe.service.web.login.access import needs

@@ -12,6 +12,7 @@ from fastapi import FastAPI, Query
 from fastapi.responses import Response
 from pydantic import BeforeValidator
 
+from abbe.service.domain.people import Permission
 from abbe.service.domain.verification import Verification
 from abbe.service.errors import NotStored
 from abbe.service.queries import checks as check_queries
@@ -20,7 +21,6 @@ from abbe.service.queries.reader import as_stored, storable
 from abbe.service.rendering.document import Document
 from abbe.service.rendering.document_page import FORMS, default_name
 from abbe.service.report.report import certified, numbered_report, stored_report
-from abbe.service.users.roles import Permission
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs

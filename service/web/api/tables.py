@@ -12,12 +12,12 @@ from fastapi.responses import Response
 from abbe.service.channel.messages import Answer
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobState
 from abbe.service.domain.push_entry import PushEntry
 from abbe.service.queries import tables
 from abbe.service.queries.reader import as_stored
 from abbe.service.storage.repositories.pages import LARGEST
-from abbe.service.users.roles import Permission
 from abbe.service.web.api.once import REPLAYED, Key, once
 from abbe.service.web.api.sources import Cursor, Filter, Limit, Number, Sources
 from abbe.service.web.core_link.core_line import CoreLine

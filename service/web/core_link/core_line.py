@@ -27,9 +27,8 @@ from abbe.service.channel.messages import (
     from_core,
 )
 from abbe.service.clock import Clock
-from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine_file import FileEdit
-from abbe.service.domain.progress import DeviceStatus, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, JobState, RunningCheck
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import CoreUnavailable
 from abbe.service.web.core_link.sample_board import MOST_EACH, MOST_LISTENERS, SampleBoard

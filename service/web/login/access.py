@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 from starlette.routing import BaseRoute, Match, Mount
 
-from abbe.service.users.roles import Permission
+from abbe.service.domain.people import Permission
 
 F = TypeVar("F", bound=Callable[..., Any])
 MARK = "__abbe_needs__"

@@ -17,10 +17,10 @@ from starlette.responses import RedirectResponse, Response
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.people import Permission
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AbbeError
 from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, Principal
-from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import Body
 from abbe.service.web.login.access import ACTIVE_HEADER, MUTATING, PUBLIC, Need, in_use, need_of, route_of
 from abbe.service.web.login.authentication import Authenticator, csrf_token

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from abbe.service.audit.book import AuditBook
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.store import Store
 from abbe.service.users.lockout import Buckets, Lockout
 from abbe.service.users.people import ANONYMOUS, LOCAL_VIEWER, Principal, UserAccounts

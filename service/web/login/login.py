@@ -11,12 +11,11 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from jinja2 import Environment
 
-from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.people import UserRecord
+from abbe.service.domain.people import Permission, UserRecord
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.queries import people
 from abbe.service.users.lockout import LoginOrigin
 from abbe.service.users.people import DEVICE_LIFE, MOST_WRONG_PINS
-from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.listening import is_local
 from abbe.service.web.login.access import PUBLIC, needs

@@ -14,9 +14,9 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
 from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
+from abbe.service.domain.people import Permission
 from abbe.service.files import may_replace
 from abbe.service.rendering.phrases import phrase
-from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.frame import current

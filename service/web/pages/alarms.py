@@ -7,10 +7,10 @@ from collections.abc import Callable
 from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 
+from abbe.service.domain.people import Permission
 from abbe.service.queries.alarms import alarm_lines, path_of_alarm
 from abbe.service.queries.status import AlarmSummary, alarms
 from abbe.service.storage.repositories.pages import LARGEST
-from abbe.service.users.roles import Permission
 from abbe.service.verification.alarms import acknowledge, shelve
 from abbe.service.web.bodies import form_of
 from abbe.service.web.login.access import needs

@@ -11,9 +11,9 @@ from types import MappingProxyType
 from fastapi import FastAPI
 from fastapi.responses import HTMLResponse
 
-from abbe.service.domain.audit_event import AuditEntry
+from abbe.service.domain.people import Permission, Role
+from abbe.service.domain.service_records import AuditEntry
 from abbe.service.rendering.phrases import phrase
-from abbe.service.users.roles import Permission, Role
 from abbe.service.web.frame import current
 from abbe.service.web.language import catalogue
 from abbe.service.web.login.access import needs

@@ -11,6 +11,7 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from abbe.service.domain.measured import RunRecord
+from abbe.service.domain.people import Permission
 from abbe.service.domain.verification import CheckFigure, Verification
 from abbe.service.errors import AbbeError, NotStored
 from abbe.service.queries.alarms import AlarmPath, alarms_of_check, path_with
@@ -24,7 +25,6 @@ from abbe.service.rendering.plots.gap import thinned
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.observations import run_data, with_earliest_mounting
-from abbe.service.users.roles import Permission
 from abbe.service.verification.compare_runs import ComparedCurve, LoadedRun, curve, incomparable_reason
 from abbe.service.web import language
 from abbe.service.web.frame import current

@@ -9,7 +9,7 @@ import numpy as np
 from markupsafe import Markup
 
 from abbe.models.arrays import F1
-from abbe.models.solvers.observability.telling import run_sensitivity
+from abbe.models.solvers.observability.rank import run_sensitivity
 from abbe.service.domain.document import Doc
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import SolutionFile, stored_solution

@@ -8,21 +8,26 @@ from collections.abc import Callable, Sequence
 from datetime import date
 from typing import Annotated
 
+import numpy as np
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse, JSONResponse
 from pydantic import AfterValidator
 
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import Rules
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobState
+from abbe.service.errors import AbbeError
 from abbe.service.jobs.interrupted import interrupted_campaign
 from abbe.service.queries.alarms import path_of_alarm
+from abbe.service.queries.checks import last_good, latest_checks
+from abbe.service.queries.reader import Reader
+from abbe.service.runs.columns import load_run
 from abbe.service.sequences.recipes.campaigns import USUAL_HZ
-from abbe.service.users.roles import Permission
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.context import Number, PageContext, can_be_stored
-from abbe.service.web.pages.last_good import NO_SHAPE, last_good_shape
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
 Recipe = Annotated[str, Query(max_length=200)]
@@ -118,3 +123,32 @@ def script_texts(lang: str) -> dict[str, str]:
     texts = language.catalogue(lang)
     states = {key: text for key, text in texts.items() if key.startswith(("measuring.", "slot."))}
     return {key: texts[key] for key in SCRIPT_KEYS} | states
+
+
+LOOK_BACK = 200
+"""Number of earlier checks among which the last good one is searched."""
+PARTS = 720
+NO_SHAPE: Doc = {"check": None, "values": []}
+
+
+def last_good_shape(reader: Reader, recipe: str, label: str) -> Doc:
+    """Mean deviation, µm, in each of at most `PARTS` equal parts of a run of the last good check; empty without such a check."""
+    good = last_good(latest_checks(reader, LOOK_BACK), recipe)
+    if good is None or not good.campaign or label not in good.runs:
+        return NO_SHAPE
+    try:
+        campaign = reader.store.campaigns.find(good.campaign)
+        run = next((r for r in reader.store.runs.all(campaign.id) if r.label == label and r.visible_status == "complete"), None)
+        columns = None if run is None else load_run(reader.store, run.id).columns
+    except AbbeError:
+        return NO_SHAPE
+    if columns is None or columns.deviation_mm is None or not columns.t_s.size:
+        return NO_SHAPE
+    t_s, deviation_um = columns.t_s, 1e3 * columns.deviation_mm
+    good_ones = columns.valid & np.isfinite(deviation_um)
+    parts = min(PARTS, -(-t_s.size // 2))
+    share = (t_s - t_s[0]) / max(float(t_s[-1] - t_s[0]), 1e-9)
+    part = np.minimum((share * parts).astype(int), parts - 1)[good_ones]
+    count = np.bincount(part, minlength=parts)
+    total = np.bincount(part, deviation_um[good_ones], minlength=parts)
+    return {"check": good.id, "values": [float(f"{v / n:.4g}") if n else None for v, n in zip(total, count, strict=True)]}

@@ -16,15 +16,15 @@ from pydantic import AfterValidator
 
 from abbe.service.clock import utc_text
 from abbe.service.compensation.proved_levels import KIND
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.measured import CampaignRecord
+from abbe.service.domain.people import Permission
 from abbe.service.domain.progress import DeviceStatus
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.queries.fleet import FleetFigure, MachineStatus, machine_statuses
 from abbe.service.secrets import mask_secrets
 from abbe.service.sequences.journal import Trouble, troubles
 from abbe.service.storage.store import Store
 from abbe.service.users.people import PIN_ROLES
-from abbe.service.users.roles import Permission
 from abbe.service.verification.alarm_states import folded, is_open
 from abbe.service.web import language
 from abbe.service.web.api.sources import Sources

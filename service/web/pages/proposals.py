@@ -11,11 +11,11 @@ from fastapi.responses import HTMLResponse
 from markupsafe import Markup
 
 from abbe.service.compensation.proposal_diff import ACTIVE, HEADINGS, compare, largest, rows
+from abbe.service.domain.people import Permission
 from abbe.service.errors import JournalChanged
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.tables import ProposalDetail, ProposalSummary, proposal, tables
 from abbe.service.rendering.plots.tables import change_plot
-from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.context import PageContext

@@ -7,8 +7,8 @@ from typing import Annotated, Literal
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse
 
+from abbe.service.domain.people import Permission
 from abbe.service.domain.results import SolutionRecord
-from abbe.service.users.roles import Permission
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
 from abbe.service.web.pages.budget import budget_screen

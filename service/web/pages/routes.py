@@ -15,6 +15,7 @@ from pydantic import AfterValidator
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
 from abbe.service.compensation.proposal_decisions import same_person
+from abbe.service.domain.people import Permission
 from abbe.service.errors import AbbeError, NotStored, TableRefused, Unusable
 from abbe.service.queries import measured
 from abbe.service.queries.alarms import path_with
@@ -23,7 +24,6 @@ from abbe.service.queries.tables import proposals
 from abbe.service.rendering.document_data import shown
 from abbe.service.rendering.palette import style_rules
 from abbe.service.rendering.phrases import phrase
-from abbe.service.users.roles import Permission
 from abbe.service.web.bodies import form_of
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs

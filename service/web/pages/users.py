@@ -10,10 +10,10 @@ from fastapi import FastAPI, Query, Request
 from fastapi.responses import HTMLResponse, RedirectResponse, Response
 from pydantic import AfterValidator
 
+from abbe.service.domain.people import Permission, Role
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.queries.people import users as listed_users
 from abbe.service.rendering.phrases import phrase
-from abbe.service.users.roles import Permission, Role
 from abbe.service.web.bodies import form_of
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs

@@ -22,7 +22,7 @@ from hypothesis.errors import Unsatisfiable
 from schemathesis import APIOperation, Case, GenerationMode
 from schemathesis.specs.openapi.checks import negative_data_rejection
 
-from abbe.service.users.roles import Role
+from abbe.service.domain.people import Role
 from tests.service.web.api_bench import Plant, open_plant, served
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"

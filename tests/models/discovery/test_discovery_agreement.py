@@ -19,7 +19,7 @@ from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case, CaseRun
 from abbe.models.discovery.solved_model import SolvedModel, predictions, solve
 from abbe.models.discovery.whitened_problem import WhitenedProblem, whiten
-from abbe.service.discovery.never_fitted import ALARM
+from abbe.service.discovery.discovery_states import ALARM
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import write_case
 from tests.experiments.bench.discovery_case import read_case

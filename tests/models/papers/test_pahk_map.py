@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.polynomial import straight_line
 from abbe.models.notation.pahk import (
     TYPES,
     iso_squareness,

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abbe.models.functions.line_fit import straight_line
+from abbe.models.functions.polynomial import straight_line
 from abbe.models.notation.pahk import TYPES
 from abbe.models.papers.pahk.offset import OffsetSetup, as_measured, line_deviation_mm, offset_terms, refer_to_origin
 from abbe.models.papers.pahk.volume_map import ParameterTables

@@ -15,8 +15,8 @@ from abbe.service.audit.book import AuditBook
 from abbe.service.capture.ingest import chunk_of
 from abbe.service.capture.segment import CHUNK, scan
 from abbe.service.capture.settings import segment_path
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.schedule import Schedule
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
 from tests.service.capture.capture_bench import abandon, batch, new_run, segment_bytes

@@ -18,7 +18,7 @@ from abbe.service.audit.book import follow
 from abbe.service.cli import run
 from abbe.service.config import load_machine
 from abbe.service.devices.session import lock_machine
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.store import Store
 from tests.certificates import issued
 from tests.patience import within

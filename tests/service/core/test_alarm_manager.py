@@ -22,8 +22,8 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.push_recovery import push_is_open
 from abbe.service.devices.session import ENVIRONMENT
-from abbe.service.domain.job_state import JobOutcome, JobState
-from abbe.service.domain.progress import ProgressSink
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobOutcome, JobState, ProgressSink
 from abbe.service.domain.push_entry import PushState as Push
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
@@ -39,7 +39,6 @@ from abbe.service.sequences.control import Control, State
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView, reconciled
-from abbe.service.users.roles import Permission
 from abbe.service.verification.alarm_states import NO_ALARM, Alarm, Note
 from abbe.service.verification.alarms import alarms_of
 from tests.patience import within

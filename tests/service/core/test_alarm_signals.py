@@ -15,7 +15,7 @@ from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
 from abbe.service.clock import utc_text
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.push_entry import PushEntry, PushState
 from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.schedule import Schedule

@@ -15,6 +15,7 @@ from abbe.service.channel.messages import MOST_JOBS, Answer, StartJob, Steering,
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import may
 from abbe.service.core.push_recovery import AGAIN_S, LOOK_S, NAME, PushRecovery
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import MachineInUse, StillActive, StoreError
 from abbe.service.scheduler.loop import Scheduler
@@ -22,7 +23,6 @@ from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.storage.store import Store
 from abbe.service.users.people import Passwords, UserAccounts
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 
 NOON = utc(2026, 6, 1, 12)

@@ -21,13 +21,13 @@ from abbe.service.channel.messages import Answer, ConfirmPrompt, StartJob, Steer
 from abbe.service.core.board import Board, SnapshotSource
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
-from abbe.service.domain.job_state import JobOutcome, JobState
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobOutcome, JobState
 from abbe.service.errors import StoreError, TableMismatch
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.sequences.control import Control, Prompts
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import Permission
 from tests.patience import within
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc
 

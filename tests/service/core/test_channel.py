@@ -22,10 +22,9 @@ from abbe.service.clock import SystemClock
 from abbe.service.config import load_machine
 from abbe.service.core import web_process
 from abbe.service.core.web_process import WebProcess
-from abbe.service.domain.job_state import JobState
 from abbe.service.domain.machine import AxisMaterial, Issuer, Item, MachineObject, Rules
 from abbe.service.domain.machine_file import FileEdit, MachineFileSummary, StatedValue
-from abbe.service.domain.progress import DeviceStatus, MachineReading, RecordedPath, RunningCheck
+from abbe.service.domain.progress import DeviceStatus, JobState, MachineReading, RecordedPath, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Needs, Schedule
 from abbe.service.errors import ChannelBroken, CoreUnavailable
 from abbe.service.storage.store import Store

@@ -20,11 +20,11 @@ from abbe.service.core import file_changes
 from abbe.service.core.file_changes import CLOSED, FileChangeContext, FileChanges
 from abbe.service.core.setup import MachineFileSource
 from abbe.service.devices.session import lock_machine
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.machine_file import FileEdit
+from abbe.service.domain.people import Permission
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import ConfigError, StoreError
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import Permission
 from tests.service.test_machine_changes import TEXT
 
 VALUE = FileEdit("limits.table_value_um", "70")

@@ -13,7 +13,7 @@ from abbe.drivers.errors import LinkDown
 from abbe.service.audit.book import AuditBook
 from abbe.service.channel.messages import Answer, StartJob
 from abbe.service.core.orders import CampaignOrder, OrderContext, full_campaigns
-from abbe.service.domain.job_state import JobOutcome
+from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.errors import MachineInUse
 from abbe.service.storage.store import Store

@@ -21,7 +21,8 @@ from abbe.service.channel.messages import Answer, RollBack, StartJob
 from abbe.service.compensation.rollback import RollbackOrder
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders, may
-from abbe.service.domain.job_state import JobOutcome, JobState
+from abbe.service.domain.people import Permission, Role
+from abbe.service.domain.progress import JobOutcome, JobState
 from abbe.service.domain.push_entry import PushState, S
 from abbe.service.errors import StoreError
 from abbe.service.scheduler.loop import Scheduler
@@ -30,7 +31,6 @@ from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import KIND, JournalView
 from abbe.service.users.people import Passwords, UserAccounts
-from abbe.service.users.roles import Permission, Role
 from tests.patience import within
 from tests.pretended_push import KEPT, TAKEN_BACK, UP_TO_ACTIVE, as_if_pushed
 from tests.service.core.fakes import FakeClock, FakeLedger, FakeShelf, fake_checks, settle, utc

@@ -8,7 +8,7 @@ import numpy as np
 
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.case import Case
-from abbe.service.discovery.discovery_engine import search
+from abbe.service.discovery.discover import search
 from abbe.service.discovery.finding import finding_of
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import ignore_progress

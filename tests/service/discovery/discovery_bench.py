@@ -66,7 +66,7 @@ class Search:
         self.verdict, self.width_um, self.holds, self.ahead, self.calls = verdict, width_um, holds, ahead, 0
 
     def __call__(self, case: Case, effects: tuple[Effect, ...], progress: ProgressSink) -> Discovery:
-        """As `abbe.service.discovery.discovery_engine.search`."""
+        """As `abbe.service.discovery.discover.search`."""
         self.calls += 1
         effect = next(e for e in effects if e.name == "backlash")
         paths = tuple(r.path for r in case.runs)

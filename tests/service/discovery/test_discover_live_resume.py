@@ -111,7 +111,7 @@ class Bench:
         self.left: int | None = None
         self._folder, self._patch = folder, monkeypatch
         self._file()
-        monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", self.search)
+        monkeypatch.setattr("abbe.service.discovery.discover.search", self.search)
         monkeypatch.setattr("abbe.service.cli.measure.ready_session", self._session)
         monkeypatch.setattr("abbe.service.campaigns.measure.measure_test", self._measure_test)
         for name in ("discovery.discover_live", "campaigns.measure"):
@@ -260,7 +260,7 @@ def test_ended_within_a_search_only_that_one_is_done_again(bench: Bench, number:
             raise KeyboardInterrupt
         return found
 
-    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", doomed)
+    monkeypatch.setattr("abbe.service.discovery.discover.search", doomed)
     assert bench.live() == 130
     assert bench.live() == 0
     assert bench.stored() == WHOLE

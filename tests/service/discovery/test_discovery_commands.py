@@ -40,7 +40,7 @@ def abbe(capsys: pytest.CaptureFixture[str], tmp_path: Path, monkeypatch: pytest
 @pytest.fixture
 def finds(monkeypatch: pytest.MonkeyPatch) -> Callable[[Search], Search]:
     def use(search: Search) -> Search:
-        monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
+        monkeypatch.setattr("abbe.service.discovery.discover.search", search)
         return search
 
     return use

@@ -201,7 +201,7 @@ def test_the_command_says_it_in_one_line(tmp_path: Path, url: str, monkeypatch: 
             other.models.add(version(None))
         return Search()(*words)
 
-    monkeypatch.setattr("abbe.service.discovery.discovery_engine.search", search)
+    monkeypatch.setattr("abbe.service.discovery.discover.search", search)
     assert cli.run(["discover", str(folder), "--db", url]) == 2
     lines = [line for line in capsys.readouterr().err.splitlines() if line.startswith("error")]
     assert len(lines) == 1

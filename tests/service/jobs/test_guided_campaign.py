@@ -21,8 +21,7 @@ from abbe.drivers.api import Condition
 from abbe.service.campaigns.campaign_run import plan_hash
 from abbe.service.cli.administration.serve import _campaigns
 from abbe.service.clock import SystemClock
-from abbe.service.domain.job_state import JobOutcome
-from abbe.service.domain.progress import ignore_progress
+from abbe.service.domain.progress import JobOutcome, ignore_progress
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind
 from abbe.service.errors import Aborted, NotObservable, PreconditionsChanged, Stopped, TableMismatch, TableRefused
 from abbe.service.jobs import guided_campaign as work

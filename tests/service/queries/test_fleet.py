@@ -17,10 +17,9 @@ import pytest
 
 from abbe.service.audit.book import AuditBook
 from abbe.service.cli import run
-from abbe.service.domain.audit_event import AuditEvent
 from abbe.service.domain.measured import Owner, this_process
 from abbe.service.domain.schedule import Schedule
-from abbe.service.domain.service_records import SILENT_AFTER, HeartbeatRecord
+from abbe.service.domain.service_records import SILENT_AFTER, AuditEvent, HeartbeatRecord
 from abbe.service.queries.fleet import HEADINGS, MachineStatus, fleet, machine_statuses, row, state_of
 from abbe.service.scheduler.heartbeat import Heartbeat
 from abbe.service.storage.store import Store

@@ -9,13 +9,11 @@ from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from typing import Any
 
-from abbe.service.domain.audit_event import AuditEvent
-from abbe.service.domain.decisions import ProposalApproval, ProposalRejection
 from abbe.service.domain.measured import ChunkRecord, ImportedRun, Owner
 from abbe.service.domain.people import TokenRecord
 from abbe.service.domain.push_entry import PushEntry, PushState
-from abbe.service.domain.results import NewVersion
-from abbe.service.domain.service_records import AlarmFacts, AlarmKind, SlotRecord
+from abbe.service.domain.results import NewVersion, ProposalApproval, ProposalRejection
+from abbe.service.domain.service_records import AlarmFacts, AlarmKind, AuditEvent, SlotRecord
 from abbe.service.errors import AbbeError
 from abbe.service.storage.database import Repository
 from abbe.service.storage.repositories.pages import LISTINGS

@@ -14,11 +14,11 @@ from fastapi.responses import PlainTextResponse, Response
 from starlette.types import Receive, Scope, Send
 
 from abbe.service.core.board import Board
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import ConfigError
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.document import HEADERS

@@ -17,7 +17,7 @@ from pathlib import Path
 import pytest
 
 from abbe.service.audit.book import AuditBook, anchor_of, digest_of, faults, follow, mac_of
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.push.journal import GENESIS
 from abbe.service.storage.store import Store
@@ -152,7 +152,7 @@ def test_writers_do_not_fork_the_chain(world: World) -> None:
 
 def test_two_processes_do_not_fork_the_chain(world: World) -> None:
     program = (
-        "import sys\nfrom abbe.service.audit.book import AuditBook\nfrom abbe.service.domain.audit_event import AuditEvent\n"
+        "import sys\nfrom abbe.service.audit.book import AuditBook\nfrom abbe.service.domain.service_records import AuditEvent\n"
         "from abbe.service.storage.store import Store\n"
         "with Store.open(sys.argv[1]) as store:\n    book = AuditBook(store, sys.argv[1])\n"
         "    for n in range(15): book.write(AuditEvent(who='w', action='a', target=str(n), outcome='done'))\n"

@@ -20,7 +20,7 @@ from abbe.service.audit.book import AuditBook, follow
 from abbe.service.cli import run
 from abbe.service.cli.administration.audit import record_all
 from abbe.service.cli.common import print_table
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.errors import AuditBroken, StoreError
 from abbe.service.storage.engine import private_file, readable_by_others
 from abbe.service.storage.store import Store

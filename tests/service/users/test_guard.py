@@ -12,9 +12,9 @@ import pytest
 from fastapi import FastAPI, Request
 from starlette.responses import StreamingResponse
 
+from abbe.service.domain.people import Permission
 from abbe.service.errors import AbbeError, StoreError
 from abbe.service.users.people import IDLE, Passwords
-from abbe.service.users.roles import Permission
 from abbe.service.web.app import as_in_host_header, create_app
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import CSRF_HEADER

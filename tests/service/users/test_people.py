@@ -10,10 +10,10 @@ from pathlib import Path
 
 import pytest
 
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.errors import PasswordRefused, UserRefused
 from abbe.service.users.lockout import MOST, Buckets, Lockout, LoginOrigin
 from abbe.service.users.people import ANONYMOUS, AT_A_TIME, MOST_WRONG_PINS, Passwords, UserAccounts, digest_of
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.service.users.conftest import PHRASE, World
 
 

@@ -24,6 +24,7 @@ from abbe.service.compensation.proposals import GatheredCampaign, make
 from abbe.service.core.board import Board
 from abbe.service.discovery.discover import discover, prepare
 from abbe.service.discovery.discovery_store import journal_of
+from abbe.service.domain.people import ALLOWED, Role
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.push_entry import PushState
 from abbe.service.domain.schedule import Schedule
@@ -36,7 +37,6 @@ from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base
 from abbe.service.users.people import Passwords, UserAccounts
-from abbe.service.users.roles import ALLOWED, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import create_app
 from abbe.service.web.listening import bind

@@ -11,7 +11,7 @@ import pytest
 
 from abbe.service.compensation.proposal_decisions import check_waiting, proposal_status, reject, valid_approval
 from abbe.service.compensation.proposal_doc import load
-from abbe.service.domain.decisions import ProposalRejection
+from abbe.service.domain.results import ProposalRejection
 from abbe.service.errors import TableRefused
 from tests.service.web.api_bench import Plant
 

@@ -12,7 +12,7 @@ from urllib.parse import quote
 import httpx
 import pytest
 
-from abbe.service.users.roles import ALLOWED, Role
+from abbe.service.domain.people import ALLOWED, Role
 from abbe.service.web.login.access import MUTATING, PUBLIC, Need, route_permissions
 from abbe.service.web.problems import MEDIA_TYPE
 from tests.service.web.api_bench import Plant, app_of, served

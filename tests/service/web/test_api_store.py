@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from concurrent.futures import ThreadPoolExecutor
 
-from abbe.service.domain.decisions import ProposalRejection
+from abbe.service.domain.results import ProposalRejection
 from abbe.service.storage.repositories.pages import LISTINGS
 from abbe.service.storage.store import Store
 

@@ -15,12 +15,12 @@ import pytest
 
 from abbe.service.channel.messages import Answer, ConfirmPrompt, Jobs, Outcome, Snapshot, StartJob, Wire, from_web
 from abbe.service.clock import SystemClock
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.people import ALLOWED, Permission, Role
+from abbe.service.domain.progress import JobState
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.sequences import journal
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine

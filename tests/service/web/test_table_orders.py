@@ -16,10 +16,10 @@ from fastapi import FastAPI
 from abbe.service.channel.messages import Answer, Jobs, Outcome, PushNow, RollBack, Wire, from_web
 from abbe.service.clock import SystemClock
 from abbe.service.core.board import Board
-from abbe.service.domain.job_state import JobState
+from abbe.service.domain.people import ALLOWED, Permission, Role
+from abbe.service.domain.progress import JobState
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.api.once import REPLAYED
 from abbe.service.web.api.sources import Sources
 from abbe.service.web.app import Parts, create_app

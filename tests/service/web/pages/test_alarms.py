@@ -7,8 +7,8 @@ import re
 import httpx
 import pytest
 
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.queries.status import AlarmSummary, alarms
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from tests.pages_world import USERS, Served, as_user
 
 

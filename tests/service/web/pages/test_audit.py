@@ -11,7 +11,7 @@ from fastapi import FastAPI
 from abbe.service.cli.administration.audit import CHANGES, RECORDS_ITSELF
 from abbe.service.core.file_changes import ACTION
 from abbe.service.core.orders import CAMPAIGN, PUSH, ROLLBACK
-from abbe.service.domain.audit_event import AuditEvent
+from abbe.service.domain.service_records import AuditEvent
 from abbe.service.rendering.phrases import LANGUAGES
 from abbe.service.web import language
 from abbe.service.web.api.tables import add_table_orders

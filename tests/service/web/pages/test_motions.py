@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from abbe.models.geometry.bases import term_values
-from abbe.models.solvers.observability.telling import run_sensitivity
+from abbe.models.solvers.observability.rank import run_sensitivity
 from abbe.models.solvers.observe import predict, run_design, setup_unknowns
 from abbe.models.solvers.priors import Priors
 from abbe.service.runs.observations import run_data

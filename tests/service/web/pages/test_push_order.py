@@ -18,11 +18,11 @@ from abbe.service.compensation.approved import PushOrder
 from abbe.service.compensation.proposal_decisions import approve
 from abbe.service.core.jobs import JobRegistry
 from abbe.service.core.orders import OrderActions, OrderContext, Orders
-from abbe.service.domain.job_state import JobOutcome, JobState
+from abbe.service.domain.people import Permission
+from abbe.service.domain.progress import JobOutcome, JobState
 from abbe.service.scheduler.loop import Scheduler
 from abbe.service.scheduler.ports import SlotState
 from abbe.service.storage.store import Store
-from abbe.service.users.roles import Permission
 from tests.pages_world import Filled, Served
 from tests.patience import within
 from tests.pretended_push import TAKEN_BACK, as_if_pushed

@@ -8,10 +8,10 @@ import httpx
 import pytest
 
 from abbe.service.clock import SystemClock
+from abbe.service.domain.people import ALLOWED, Permission, Role
 from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.users.lockout import LoginOrigin
-from abbe.service.users.roles import ALLOWED, Permission, Role
 from abbe.service.web.app import create_app
 from abbe.service.web.login.access import route_permissions
 from abbe.service.web.login.auth_middleware import CSRF_HEADER

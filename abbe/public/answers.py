@@ -1,11 +1,12 @@
-"""A drawing for notebooks and files."""
+"""What notebooks get: a value with its standard uncertainty, and a drawing."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
-from abbe.service.rendering.page_file import write_page
+from abbe.service.files import write_page
 from abbe.service.rendering.palette import style_rules
 
 
@@ -27,3 +28,18 @@ class Picture:
             The file cannot be written.
         """
         write_page(f"<!doctype html><meta charset='utf-8'><title>Abbe</title>{self._repr_html_()}\n", Path(target))
+
+
+class Estimate(NamedTuple):
+    """A value and its standard uncertainty (GUM, k = 1), both in ``unit``.
+
+    ``status``: "observed", "weak" or "not observable". A value that is not observable means nothing without the other values.
+    """
+
+    value: float
+    u: float
+    unit: str
+    status: str
+
+    def __str__(self) -> str:
+        return f"{self.value:.3g} ± {2.0 * self.u:.2g} {self.unit} (k = 2, {self.status})"

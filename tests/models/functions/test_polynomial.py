@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from abbe.models.functions.line_fit import slope_through_origin, straight_line
+from abbe.models.functions.polynomial import slope_through_origin, straight_line
 
 POINTS = st.lists(st.tuples(st.floats(-1e3, 1e3), st.floats(-1e3, 1e3)), min_size=2, max_size=30, unique_by=lambda p: round(p[0], 2))
 
