@@ -58,7 +58,8 @@ def wandering(problem: WhitenedProblem) -> tuple[Structure, ...]:
             tests = tuple(dict.fromkeys(p.test for p in problem.paths if p.kind == kind))
             over = 1.0 / (1.0 - colour.memory)
             title = (
-                f"noise of the {INSTRUMENTS[kind]} is not white: {colour.share:.0%} of its variance wanders over some {over:.0f} readings"
+                f"noise of the {INSTRUMENTS[kind]} is not white:"
+                f" {colour.share:.0%} of its variance is correlated over about {over:.0f} readings"
             )
             out.append(Structure(f"{PREFIX}wander:{kind}", title, colour.gain, Localization(tests, depends_on=("time",), shape=title)))
     return tuple(out)

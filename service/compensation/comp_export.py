@@ -529,10 +529,10 @@ def seal_status(path: Path, read: Sequence[TextFile], config: MachineFile | None
     try:
         sealed = read_plain(seal, LARGEST)
     except NotPlainError as error:
-        raise SignatureRefused(f"{seal}: {error.strerror}", "remove the signature: the files then count as a candidate") from None
+        raise SignatureRefused(f"{seal}: {error.strerror}", "remove the signature: the files are then only a candidate") from None
     except OSError as error:
         raise FileFormatError(
-            f"{seal}: cannot be read: {error.strerror}", "make the signature readable, or remove it: the files then count as a candidate"
+            f"{seal}: cannot be read: {error.strerror}", "make the signature readable, or remove it: the files are then only a candidate"
         ) from None
     expected = ExpectedContent(config.name, site_of(config).limits.digest(), ask.form, [*ask.trusted, *config.signatures.trusted], ask.base)
     found = contents(path)

@@ -157,7 +157,7 @@ def check_known(journal: JournalView, base: Base) -> None:
     accepted = {facts((e,)).accepted_crc for e in journal.entries if e.state is PushState.ACCEPTED}
     if base.image not in known_images(journal) and crc32(base.image) not in accepted:
         raise TableMismatch(
-            f"the table in force ({base.crc:08X}) is not one that the push journal knows",
+            f"the table in force ({base.crc:08X}) is not in the push journal",
             "look at the controller; nothing was written",
         )
 

@@ -127,7 +127,7 @@ def _shift_lines(answer: StandstillAnswer) -> list[str]:
         (answer.found.shift_since_start, "changes of temperature", better if answer.found.since_start else worse),
     )
     shifts = [_shift_line(answer.runs, shift, what, then) for shift, what, then in found if shift is not None]
-    return shifts or [f"shift of several runs: none that chance does not explain (p > {CHANCE:g})"]
+    return shifts or [f"shift of several runs: none beyond chance (p > {CHANCE:g})"]
 
 
 def _shift_line(runs: Sequence[str], shift: Shift, what: str, then: str) -> str:

@@ -311,7 +311,7 @@ def _places(body: _ReadingRows) -> tuple[F1, F1, str]:
     columns, n = body.columns, len(body.rows)
     if columns.target is None:
         at = float(columns.at_mm or 0.0)
-        return np.full(n, at), np.ones(n), f"the axis stood at {at:g} mm: its readings count from the first one"
+        return np.full(n, at), np.ones(n), f"the axis stood at {at:g} mm: its readings are relative to the first one"
     target = body.numbers("target")[0] * LENGTHS[columns.target.unit]
     if columns.direction is None:
         return target, _by_order(body, target), "the table has no column of the direction: the order of the targets decided the direction"

@@ -92,7 +92,7 @@ def lines_of(found: CyclicError) -> list[str]:
         )
     noise = plain(found.u_reading / NM, 2)
     out.append(
-        f"{found.samples} samples, {found.outliers:.1%} of them outliers; in a single reading the cyclic error counts as u = {noise} nm"
+        f"{found.samples} samples, {found.outliers:.1%} of them outliers; in a single reading the cyclic error contributes u = {noise} nm"
     )
     return out
 

@@ -156,7 +156,7 @@ def _objections(finding: Finding, store: Store, machine: str) -> AlarmFacts:
     wrong = [e for e in entering(finding) if e.remedy != "table" and e.label not in known]
     why = [f"{e.full_title} is a matter for {REMEDIES[e.remedy]}: {e.remedy_text}" for e in wrong]
     if finding.verdict == "unknown":
-        why.append("the model lacks something that the catalogue does not know, and a table would hide it")
+        why.append("the model lacks an effect that is not in the catalogue, and a table would hide it")
     unnamed = finding.verdict == "unknown" and not finding.effects
     return AlarmFacts(against="; ".join(why), rms_um=rms_um, unnamed=unnamed)
 

@@ -198,7 +198,7 @@ def _binding(c: Candidate, context: CandidateContext) -> Iterator[str]:
     if c.map_version != context.map_version:
         yield f"MAP: made for register map {c.map_version}, the controller has {context.map_version}"
     if c.lsb_nm != context.lsb_nm:
-        yield f"SCALE: a value counts {c.lsb_nm} nm in the table, {context.lsb_nm} nm in the controller"
+        yield f"SCALE: one unit is {c.lsb_nm} nm in the table, {context.lsb_nm} nm in the controller"
     if c.length_unit != "mm":
         yield f"UNIT: lengths are in {c.length_unit!r}, not in mm"
     if c.base_crc != context.active_crc:

@@ -98,7 +98,7 @@ def stood_for(waiting_name: str, slot: datetime, by: datetime, hindrance: Hindra
     """Return the outcome of a slot that the run of a later slot replaces."""
     why = f"; it had to wait because {hindrance.text}" if hindrance is not None else ""
     return SlotOutcome(
-        f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC stands for it{why}"
+        f"missed: see {by:%FT%RZ}", "SCH-005", f"{_slot(waiting_name, slot)} was missed: the run of slot {by:%F %R} UTC replaces it{why}"
     )
 
 

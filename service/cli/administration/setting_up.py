@@ -157,7 +157,7 @@ def doctor(machine: MachineOption = None, as_json: JsonOption = False) -> None:
         print_table(("what", "", "found", "what to do"), [(one.what, one.state, one.text, one.remedy) for one in found])
         word = "is not ready" if bad else "is ready"
         then = "abbe doctor" if bad else "abbe measure --recipe quick-check"
-        verdict = f"{loaded.machine.name} {word}: {len(found)} things examined, {bad} bad, {look} to look at"
+        verdict = f"{loaded.machine.name} {word}: {len(found)} points examined, {bad} bad, {look} to look at"
         conclude(then, machine=machine, verdict=verdict)
     raise typer.Exit(1 if bad else 0)
 

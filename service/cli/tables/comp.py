@@ -181,7 +181,7 @@ def import_tables(  # noqa: PLR0913 - one argument for each option
     step_moved: StepOption = None,
     trust: Annotated[
         list[str] | None,
-        typer.Option("--trust", metavar="KEY", help="Public key whose signature counts, besides the machine file's.", show_default=False),
+        typer.Option("--trust", metavar="KEY", help="Public key to trust, besides those of the machine file.", show_default=False),
     ] = None,
     base: Annotated[str | None, typer.Option("--base", help="Fingerprint of the table in force, if known.", show_default=False)] = None,
     db: DbOption = None,

@@ -47,7 +47,7 @@ def test_days_of_a_standing_axis_show_its_thermal_response(abbe: Abbe) -> None:
     assert "campaign heat: 8 runs at standstill (ISO 230-3), temperatures ambient, spindle, bed" in done.out
     assert "Heat explains it in part." in done.out
     assert done.err.endswith("next: abbe report heat\n")
-    assert "shift of several runs: none that chance does not explain (p > 0.01)" in done.out
+    assert "shift of several runs: none beyond chance (p > 0.01)" in done.out
     told = abbe("discover", "heat", "--json").out
     StandstillFile.model_validate_json(told)
     doc = json.loads(told)
