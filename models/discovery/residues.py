@@ -149,7 +149,7 @@ def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[s
         if f.pick.unnamed or _scores(problem, f, others):
             continue
         leant = sorted(g.label for g in gone if _scores(problem, f, [*others, g])) or sorted(g.label for g in gone)
-        out[f.pick.label] = f"evidence {f.score / 2.0:.0f}, but none without the rejected {', '.join(leant)}"
+        out[f.pick.label] = f"evidence {f.score / 2.0:.0f}, which vanishes without the rejected {', '.join(leant)}"
     return out
 
 

@@ -96,7 +96,7 @@ class Trial:
         return bool(of_it) and all(of_it)
 
     async def status(self) -> CompStatus:
-        """Return the present state of the banks; record its boot id."""
+        """Return the present state of the banks; record the controller's boot id."""
         now = await self.controller.comp_status()
         self.boots.add(now.boot_id)
         return now

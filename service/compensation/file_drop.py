@@ -171,7 +171,7 @@ def confirm(source: Path, back: Path, settings: FormatSettings, *, turned: bool 
     Raises
     ------
     FileFormatError, TableFileError
-        There is no receipt of files that lie there, or a file cannot be read.
+        There is no receipt for these files, or a file cannot be read.
     TableContradicts
         The control holds other corrections; the message names the mistake, if it is a known one.
     """
@@ -191,7 +191,7 @@ def seen(source: Path, who: str) -> Drop:
     Raises
     ------
     FileFormatError
-        There is no receipt of files that lie there.
+        There is no receipt for these files.
     """
     return _keep(place_of(source), replace(_lying_there(source), seen_by=who))
 

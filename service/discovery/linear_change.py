@@ -47,7 +47,7 @@ def drift_text(store: Store, made: StoredProposal) -> str:
 
 
 def largest_sure(changes: dict[str, tuple[float, float]]) -> str | None:
-    """Return the name of the largest change above its U (k = 2), else None; given are change and standard uncertainty by name."""
+    """Return the name of the largest change above its U (k = 2), else None; ``changes``: change and standard uncertainty by name."""
     sure = {name: abs(change) for name, (change, u) in changes.items() if abs(change) > COVERAGE * u}
     return max(sure, key=lambda name: sure[name], default=None)
 

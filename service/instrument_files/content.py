@@ -151,5 +151,5 @@ def axis_of(text: str) -> str:
 
 
 def along(values: list[float], n: int) -> F1:
-    """Interpolate values from the start, the end, and perhaps the middle of a test to its n readings."""
+    """Interpolate one to three values, spread evenly over a test from start to end, to its n readings."""
     return np.asarray(np.interp(np.linspace(0.0, 1.0, n), np.linspace(0.0, 1.0, len(values)), values))

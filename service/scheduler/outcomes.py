@@ -44,17 +44,17 @@ class Waiting:
 
 
 def busy(name: str) -> Hindrance:
-    """Return the hindrance that another check has the machine."""
+    """Return the hindrance: another check uses the machine."""
     return Hindrance("skipped: busy", f"{name!r} was still running")
 
 
 def maintenance(name: str) -> Hindrance:
-    """Return the hindrance that a maintenance window is open."""
+    """Return the hindrance: a maintenance window is open."""
     return Hindrance("missed: maintenance", f"it lies in the maintenance window {name!r}")
 
 
 def not_ready(text: str) -> Hindrance:
-    """Return the hindrance that a precondition of the schedule is not met."""
+    """Return the hindrance: a precondition of the schedule is not met."""
     return Hindrance("missed: not ready", text)
 
 

@@ -195,7 +195,7 @@ def test_a_lone_name_that_leans_on_one_residue_is_told_with_that_residue() -> No
     leans = Selection(lead, gain=beside, score=beside - cost)
     found = [leans, Selection(other, 500.0, 450.0), Selection(idle, 60.0, 10.0)]
     told = leaning(problem, found, {other.label, idle.label, "vibration:X"})
-    assert told == {lead.label: f"evidence {leans.score / 2.0:.0f}, but none without the rejected {other.label}"}
+    assert told == {lead.label: f"evidence {leans.score / 2.0:.0f}, which vanishes without the rejected {other.label}"}
     assert leaning(problem, found, {idle.label}) == {}
     assert leaning(problem, [leans], {"vibration:X"}) == {}  # a variance effect is in no fit
 
