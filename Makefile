@@ -20,7 +20,7 @@ COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes
 .PHONY: help demo test test-long lint fmt docs site pictures bench lock release clean
 # Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
-WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); echo $$(( n < 8 ? n : 8 )))
+WORKERS ?= $(shell n=$$(( $(CORES) * 3 )); echo $$(( n < 8 ? n : 8 )))
 
 help: ## list what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
@@ -29,7 +29,7 @@ help: ## list what can be made
 demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a report
 	@$(BIN)/abbe demo $(ARGS)
 
-test: $(DEV_READY) ## all tests, side by side, 10 to 20 minutes on two cores; ARGS=FILE: only these, one after the other
+test: $(DEV_READY) ## all tests, side by side, about 10 minutes on two cores; ARGS=FILE: only these, one after the other
 	@env -u PYTHONDONTWRITEBYTECODE OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(or $(ARGS),-p tests.progress -n $(WORKERS) --dist loadfile --no-loadscope-reorder --timeout 400)
 
 test-long: $(DEV_READY) ## hours: what is too long for every run, at full size; Ctrl-C stops it, and it goes on where it was

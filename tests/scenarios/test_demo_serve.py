@@ -18,7 +18,7 @@ from abbe.service.demo import demo_serve
 from abbe.service.demo.demo_serve import DRIFT_UM_PER_M, MARGIN_UM, USER, service_config
 from abbe.service.errors import StoreError
 from abbe.service.storage.store import Store
-from tests.system.serve_bench import Process, require
+from tests.system.serve_bench import Process, chromium_program
 from tests.system.test_serve_page import QUIET
 
 pytestmark = [pytest.mark.scenario, pytest.mark.browser, pytest.mark.timeout(1200)]
@@ -39,7 +39,7 @@ def demo(tmp_path: Path) -> Iterator[Process]:
 @pytest.fixture
 def page() -> Iterator[Page]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=require("chromium"), args=QUIET)
+        browser = playwright.chromium.launch(executable_path=chromium_program(), args=QUIET)
         yield browser.new_page(viewport={"width": 1280, "height": 768}, locale="en")
         browser.close()
 

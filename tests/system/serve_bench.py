@@ -34,6 +34,11 @@ def require(name: str, *places: str) -> str:
     return found
 
 
+def chromium_program() -> str:
+    """Return the path of Chromium: of its headless shell, the same engine for a third of the processor time, or of the whole browser."""
+    return shutil.which("chromium-headless-shell") or require("chromium")
+
+
 def free_port() -> int:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))

@@ -20,7 +20,7 @@ from abbe.service.domain.schedule import Schedule
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify
 from tests.pages_world import Filled, Served, served
-from tests.system.serve_bench import free_port, require, service
+from tests.system.serve_bench import chromium_program, free_port, service
 from tests.system.serve_check import Result
 from tests.system.test_serve_users import PHRASE, add_user
 
@@ -51,7 +51,7 @@ class Seen:
 @contextmanager
 def launched(*more: str) -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=require("chromium"), args=[*QUIET, *more])
+        chromium = playwright.chromium.launch(executable_path=chromium_program(), args=[*QUIET, *more])
         try:
             yield chromium
         finally:
