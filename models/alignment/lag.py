@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import scipy
 
 from abbe.models.arrays import F1, F2
 
@@ -82,44 +81,3 @@ def _newey_west(score: F1) -> float:
     for k in range(1, reach + 1):
         total += 2.0 * (1.0 - k / (reach + 1)) * float(score[k:] @ score[:-k])
     return float(np.sqrt(max(total, float(score @ score) * 0.1)))
-
-
-def lag_between_ways(t_s: F1, out: F1, back: F1, *, columns: F2 | None = None, search_s: float = 0.5, smooth_s: float = 2.0) -> Lag:
-    """Fit the lag of readings taken out and back along one path at one speed, which shifts the two patterns by twice the lag.
-
-    Parameters
-    ----------
-    t_s : array, shape (n,)
-        Times of the readings on the way out, evenly spaced.
-    out, back : array, shape (n,)
-        Readings on the way out, and on the way back at the same positions.
-    columns : array, shape (n, k), optional
-        Other differences between the way out and the way back, e.g. lost motion (direction of the bar times the change of sign of each
-        axis). A constant is always included.
-    search_s : float
-        The lag counts as determined if its uncertainty is below half of this value.
-    smooth_s : float
-        Window of the smoothing cubic that gives the slope of the pattern; noise in the slope would hide the lag.
-
-    Raises
-    ------
-    ValueError
-        The path is shorter than three windows.
-    """
-    step = float(np.median(np.diff(t_s)))
-    width = max(2, round(smooth_s / step / 2)) * 2 + 1
-    if t_s.size < 3 * width:
-        raise ValueError(f"lag: the path has {t_s.size} readings, a smoothing window of {smooth_s:g} s needs {3 * width}")
-    slope_all = np.asarray(scipy.signal.savgol_filter(0.5 * (out + back), width, 3, deriv=1, delta=step))
-    inner = slice(width, t_s.size - width)  # at the ends the window is incomplete
-    slope = slope_all[inner]
-    free = np.ones((t_s.size, 1)) if columns is None else np.column_stack([np.ones(t_s.size), columns])
-    basis = np.linalg.qr(free[inner])[0]
-    half = 0.5 * (out - back)[inner]
-    slope, half = slope - basis @ (basis.T @ slope), half - basis @ (basis.T @ half)
-    power = float(slope @ slope)
-    if power <= 1e-30:
-        return Lag(0.0, np.inf, determined=False)
-    lag = -float(slope @ half) / power
-    u = _newey_west(slope * (half + lag * slope)) / power
-    return Lag(lag, u, determined=bool(u < 0.5 * search_s))

@@ -16,7 +16,6 @@ from abbe.models.compensation.distances import Pairs, random_pairs
 from abbe.models.compensation.tables import check_unit, grid_positions
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import RigidFree, rigid_design
-from abbe.models.machine import AXES
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation, unobserved_mm
@@ -172,11 +171,6 @@ class GridTable:
         """Return the correction at commanded positions, mm, shape (n, 3): trilinear, constant beyond the grid."""
         return trilinear(self.position_mm, self.correction_mm, axes_mm)
 
-    @property
-    def largest_step_mm(self) -> float:
-        """Largest change of any axis' correction from one node to the next; controllers limit this change, because steps mark surfaces."""
-        return max(float(np.abs(np.diff(self.correction_mm, axis=a)).max()) for a in range(3))
-
 
 def nodes_mm(position_mm: tuple[F1, F1, F1]) -> F2:
     """Return all nodes of a grid, X slowest, shape (nx ny nz, 3)."""
@@ -281,33 +275,3 @@ def quantise_grid(table: GridTable, lsb_mm: float) -> GridTable:
     """
     check_unit(lsb_mm)
     return replace(table, correction_mm=np.round(table.correction_mm / lsb_mm) * lsb_mm)
-
-
-def check_steps(table: GridTable, limit_mm: float) -> None:
-    """Refuse a grid whose correction changes by more than the controller allows from one node to the next.
-
-    Raises
-    ------
-    ValueError
-        A step is too large (the message names axis, node and size), or the limit is negative or NaN.
-    """
-    if not limit_mm >= 0:
-        raise ValueError(f"grid table: the largest allowed step is {limit_mm} mm, but must be a number of 0 or more")
-    for a in range(3):
-        step = np.abs(np.diff(table.correction_mm, axis=a)).max(axis=3)
-        worst = np.unravel_index(int(step.argmax()), step.shape)
-        if step[worst] > limit_mm:
-            at = ", ".join(f"{axis} {table.position_mm[k][i]:g}" for k, (axis, i) in enumerate(zip(AXES, worst, strict=True)))
-            raise ValueError(
-                f"grid table: from the node at {at} to the next on {AXES[a]} the correction changes by {1e3 * step[worst]:.1f} um, "
-                f"but the controller allows {1e3 * limit_mm:.1f} um: take more nodes on {AXES[a]}"
-            )
-
-
-def quantisation_mm(lsb_mm: float) -> float:
-    """Return the standard uncertainty of one axis' interpolated correction from rounding to the controller's unit, mm.
-
-    Rounding gives each node a standard uncertainty of lsb / sqrt(12). Trilinear interpolation averages eight nodes, which leaves
-    (2/3)^(3/2) of this value as rms over a cell. A distance has two ends and so sqrt(2) times this uncertainty.
-    """
-    return float(lsb_mm / np.sqrt(12.0) * (2.0 / 3.0) ** 1.5)

@@ -128,11 +128,6 @@ def as_angle(function: AxisFunction, reference_mm: float) -> FromZero:
     return FromZero(function, constant)
 
 
-def as_positioning(function: AxisFunction, start_mm: float) -> FromZero:
-    """Make a positioning error zero at the start of the measurement; the constant is the error there, mm. Raises as `as_angle`."""
-    return as_angle(function, start_mm)
-
-
 def least_squares_line(function: AxisFunction, stroke_mm: ArrayLike) -> tuple[float, float]:
     """Return slope (per mm) and value at axis zero of the line that `as_straightness` removes; raises as that does."""
     return _line(function, _inside(function, stroke_mm))

@@ -67,17 +67,6 @@ class Budget:
         return "\n".join(rows)
 
 
-def budget_at(prediction: Prediction, index: int) -> Budget:
-    """Budget at one of the predicted points.
-
-    Raises
-    ------
-    IndexError
-        The prediction has no such point.
-    """
-    return _budget(prediction, np.array([range(len(prediction.points_mm))[index]]))
-
-
 def budget_over(prediction: Prediction) -> Budget:
     """Budget of the mean variance over all predicted points, that is, of the rms uncertainty. Points should be a grid over the volume."""
     return _budget(prediction, np.arange(len(prediction.points_mm)))

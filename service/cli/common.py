@@ -50,6 +50,12 @@ MachineOption = Annotated[
     ),
 ]
 JsonOption = Annotated[bool, typer.Option("--json", help="Print JSON on stdout.")]
+CampaignArgument = Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")]
+ReportOption = Annotated[
+    Path | None,
+    typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
+]
+WithoutOption = Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")]
 
 
 def named_machine(given: Path | None) -> Path | None:

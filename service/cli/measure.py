@@ -43,6 +43,7 @@ AcceptTable = Annotated[
     bool,
     typer.Option("--accept-table", help="I have looked: the table in force, which this database did not push, is right."),
 ]
+WaitOption = Annotated[float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")]
 CheckOption = Annotated[
     Path | None,
     typer.Option("--check", metavar="FILE.toml", help="Verify with these poses of the artefact, not with diagonals and a helix."),
@@ -232,9 +233,7 @@ def _source(recipe: str, helix: str, rate_hz: int) -> RecipeSource:
 def correct(
     campaign: Annotated[str, typer.Argument(help="Identification campaign in the store.")],
     before: Annotated[str, typer.Option(help="Verification campaign measured with the present table; default: it is measured now.")] = "",
-    wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
-    ] = 600.0,
+    wait_s: WaitOption = 600.0,
     check: CheckOption = None,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,

@@ -98,7 +98,6 @@ class PushResult:
     bank: int
     crc: int
     previous_bank: int
-    previous_crc: int
     kept: bool
     why: str
     log: tuple[str, ...]
@@ -325,7 +324,7 @@ class Pushing:
                 last = ended.journal[-1]
                 return PushResult(
                     last.push, known.table, known.target, known.crc, known.base_bank,
-                    known.base_crc, last.state is PushState.KEEP, why, push_log(ended.journal),
+                    last.state is PushState.KEEP, why, push_log(ended.journal),
                 )  # fmt: skip
             case PushState.REJECTED:
                 raise TableRefused.because(known.reasons)

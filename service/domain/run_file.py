@@ -59,7 +59,6 @@ class StatedFigure(FileObject):
 
 RUN_FORMAT = "abbe-run/1"
 CAMPAIGN_FORMAT = "abbe-campaign/1"
-ERRORS_FORMAT = "abbe-errors/1"
 
 Test = Literal["ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear"]
 Known = Literal["rigid6", "rigid21", "setup_centre_offset", "bar_length_error", "mirror_tilt"]

@@ -74,7 +74,6 @@ class Solved:
     joint: JointSolution
     helices: dict[str, HelixSolution]
     step_totals: dict[str, dict[str, float]]
-    noise_bar_mm: float
     flags: tuple[CampaignIssue, ...] = ()
     digests: dict[str, str] = field(default_factory=dict)
     rows: dict[str, NDArray[np.int64]] = field(default_factory=dict)
@@ -144,7 +143,6 @@ def solve_runs(
         joint,
         helices,
         step_diagonals(used),
-        noise,
         tuple(flags),
         digests,
         rows,

@@ -7,7 +7,6 @@ from dataclasses import dataclass
 
 from abbe.simulators.ballbar.wire import SAMPLE, SYNC_BYTES, encode
 
-GARBAGE = ("random", "ones", "sync", "header")
 _SAMPLE = struct.Struct("<IQiH")
 _OVERHEAD = 6
 

@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from abbe.service.cli.common import (
+    CampaignArgument,
     DbOption,
     JsonOption,
     MachineOption,
+    ReportOption,
+    WithoutOption,
     check_endings,
     conclude,
     database_url,
@@ -35,14 +38,11 @@ if TYPE_CHECKING:
 
 
 def discover(  # noqa: PLR0913 - one argument for each option
-    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
-    report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
-    ] = None,
+    campaign: CampaignArgument,
+    report: ReportOption = None,
     db: DbOption = None,
     machine: MachineOption = None,
-    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    without: WithoutOption = None,
     live: Annotated[bool, typer.Option("--live", help="Measure what is proposed on the machine, and continue.")] = False,
     accept_table: AcceptTable = False,
     as_json: JsonOption = False,

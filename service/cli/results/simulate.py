@@ -10,9 +10,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from abbe.service.cli.common import (
+    CampaignArgument,
     DbOption,
     JsonOption,
     MachineOption,
+    ReportOption,
+    WithoutOption,
     check_endings,
     check_inputs,
     conclude,
@@ -31,15 +34,12 @@ if TYPE_CHECKING:
 
 
 def simulate(
-    campaign: Annotated[str, typer.Argument(help="Campaign in the database, or a folder with campaign.json.")],
+    campaign: CampaignArgument,
     as_json: JsonOption = False,
-    report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
-    ] = None,
+    report: ReportOption = None,
     db: DbOption = None,
     machine: MachineOption = None,
-    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    without: WithoutOption = None,
 ) -> None:
     """Predict every run with the present model, fitted to the identify runs, and show measured against simulated. Nothing is stored.
 

@@ -15,6 +15,8 @@ from abbe.service.cli.common import (
     DbOption,
     JsonOption,
     MachineOption,
+    ReportOption,
+    WithoutOption,
     answer_into,
     check_endings,
     conclude,
@@ -65,10 +67,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,
-    report: Annotated[
-        Path | None,
-        typer.Option("--report", metavar="FILE", help="Also write a report: FILE.pdf, .html, .csv or .json.", show_default=False),
-    ] = None,
+    report: ReportOption = None,
     tables: Annotated[bool, typer.Option("--tables", help="Also show what each kind of table could reach.")] = False,
     grid: Annotated[
         Path | None, typer.Option("--grid", metavar="FILE.csv", help="Also write the 3-D grid of corrections.", show_default=False)
@@ -84,7 +83,7 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
     nodes: Annotated[int, typer.Option("--nodes", min=2, max=33, help="Nodes of the grid on each axis.")] = 9,
     unit_um: Annotated[float, typer.Option("--unit-um", min=1e-6, max=10.0, help="The machine's unit for tables and grid, µm.")] = 0.1,
     trials: Annotated[bool, typer.Option("--monte-carlo", help="Also check the stated uncertainty by trials.")] = False,
-    without: Annotated[list[str] | None, typer.Option("--without", metavar="RUN", help="Leave a run out; may be repeated.")] = None,
+    without: WithoutOption = None,
     without_scale: Annotated[
         bool, typer.Option("--without-scale", help="Leave scales that the runs determine poorly out of --grid, --tables and --at.")
     ] = False,

@@ -7,7 +7,15 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from abbe.service.cli.common import JsonOption, MachineOption, answer, conclude, machine_file, print_json, print_table
-from abbe.service.cli.measure import AcceptTable, CheckOption, checking_poses, ready_session, say_correction, verification_before
+from abbe.service.cli.measure import (
+    AcceptTable,
+    CheckOption,
+    WaitOption,
+    checking_poses,
+    ready_session,
+    say_correction,
+    verification_before,
+)
 from abbe.service.cli.tables.comp_proposals import ProposalArgument
 
 if TYPE_CHECKING:
@@ -22,9 +30,7 @@ def push(
     before: Annotated[
         str, typer.Option(metavar="CAMPAIGN", help="Verification campaign measured with the present table; default: it is measured now.")
     ] = "",
-    wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
-    ] = 600.0,
+    wait_s: WaitOption = 600.0,
     check: CheckOption = None,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
@@ -182,9 +188,7 @@ def commission(
         bool,
         typer.Option("--one-bank", help="The control has one table; I accept the lower level: nothing acts while tables are exchanged."),
     ] = False,
-    wait_s: Annotated[
-        float, typer.Option(help="How long to wait for a safe machine if an unverified table is active; 0: not at all.")
-    ] = 600.0,
+    wait_s: WaitOption = 600.0,
     accept_table: AcceptTable = False,
     machine: MachineOption = None,
     as_json: JsonOption = False,

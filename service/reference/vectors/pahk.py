@@ -30,8 +30,6 @@ FORMS: dict[str, tuple[Form, float, str]] = {
     "delta_paper_matrix": ("small", 3e-13, SUBTRACTED),
 }
 """By key of the file: form of the kinematics, rounding of the stored number, mm, and its reason."""
-FLOAT64 = 4e-15
-"""Tolerance of the root of a sum of 21 squares: without cancellation, a few units in the last place."""
 PRINTED_TYPE = "MB1"
 """Machine for which P (5) is printed; its cases must contain these numbers."""
 LENGTHS = "two lengths of 1142 mm were subtracted"

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from abbe.models.alignment.clock import LEAST_PAIRS, across, breaks, fit_clock, lower_envelope, relative_rate
-from abbe.models.alignment.lag import fit_lag, lag_between_ways
+from abbe.models.alignment.lag import fit_lag
 from tests.experiments.mathematics.position import position_in_stream, position_on_path
 
 LEAST_DELAY_S = 5e-4
@@ -174,28 +174,9 @@ def test_lag_of_a_signal_behind_the_position_stream_within_its_uncertainty():
     assert 0.89 <= np.mean(np.abs(z) <= 2.0) <= 0.99
 
 
-def test_lag_of_a_bar_from_both_ways_round_within_its_uncertainty():
-    z = []
-    t = np.arange(0.0, 60.0, 0.01)
-    for seed in range(120):
-        rng = np.random.default_rng(seed)
-        lag = rng.uniform(-0.05, 0.05)
-
-        def pattern(at):
-            return 0.01 * np.sin(2 * np.pi * at / 12.0 + 1.0) + 0.004 * np.cos(2 * np.pi * at / 5.0)
-
-        side = np.sign(np.cos(2 * np.pi * t / 12.0))[:, None]
-        out = pattern(t - lag) + 5e-4 * rng.normal(size=t.size) + 0.002 * side[:, 0]
-        back = pattern(t + lag) + 5e-4 * rng.normal(size=t.size) - 0.002 * side[:, 0]
-        found = lag_between_ways(t, out, back, columns=side)
-        z.append((found.lag_s - lag) / found.u_s)
-    assert 0.89 <= np.mean(np.abs(z) <= 2.0) <= 0.99
-
-
 def test_where_nothing_moves_there_is_no_lag_to_tell():
     t = np.linspace(0.0, 10.0, 100)
     assert not fit_lag(t, np.zeros(100), t, np.zeros(100)).determined
-    assert not lag_between_ways(np.arange(0.0, 20.0, 0.01), np.zeros(2000), np.zeros(2000)).determined
 
 
 def test_positions_at_sample_times_come_from_the_stream_or_the_path_and_are_unknown_outside():

@@ -17,7 +17,6 @@ from abbe.models.compensation.achievable import (
 )
 from abbe.models.compensation.additive import SQUARENESS_SLOPES, mean_linear
 from abbe.models.compensation.distances import correction_error_mm, figures, inner_box_mm, predict_distances, random_pairs
-from abbe.models.compensation.grid import quantisation_mm
 from abbe.models.compensation.nine_tables import nine_tables, table_design
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.solvers.assessment import observability_of
@@ -214,7 +213,7 @@ def test_every_kind_states_what_it_leaves_and_more_table_leaves_less(solved):
     assert all(r.distances.rms_mm >= r.distances.unknown_mm * 0.75 for r in rows.values())
     grid = rows["grid 9 x 9 x 9"]
     assert grid.entries == 3 * 9**3
-    assert grid.rounding_mm == pytest.approx(np.sqrt(2) * quantisation_mm(1e-4), rel=0.2)
+    assert grid.rounding_mm == pytest.approx(np.sqrt(2) * 1e-4 / np.sqrt(12.0) * (2.0 / 3.0) ** 1.5, rel=0.2)
     one_tool = rows["tables of single motions, right for this tool only"]
     alone = rows["tables of the motions that are observable by themselves"]
     assert one_tool.distances.rms_mm < rows["nine tables"].distances.rms_mm < alone.distances.rms_mm

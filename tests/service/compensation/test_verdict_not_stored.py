@@ -47,7 +47,7 @@ async def test_the_note_says_what_is_in_force(tmp_path: Path, monkeypatch: pytes
 
             async def bring(self, *_: object) -> PushResult:
                 work.after, work.decision, work.verified_as = AFTER, VerificationDecision(kept, "as decided"), "verify-after-push-1"
-                return PushResult(1, 1, 1, 7, 0, 5, kept, "as decided", ())
+                return PushResult(1, 1, 1, 7, 0, kept, "as decided", ())
 
         held = SimpleNamespace(by="anna", approval=lambda clock: None)
         work = Work(cast("Any", bench), cast("Any", SimpleNamespace(precheck=held, level=3)), None, None, AFTER, cast("Any", None))

@@ -74,7 +74,7 @@ def test_more_weak_points_never_make_it_better():
 def assessed(kind: str):
     case = draw_case(8, kind)
     runs = [replace(r, length_calibrated=False, u_length_mm=None) if r.kind == "bar" else r for r in case.runs]
-    return assess(Solved(solve_joint(case.machine, tuple(runs), model="rigid6"), {}, {}, 1e-3, inputs=INPUTS))
+    return assess(Solved(solve_joint(case.machine, tuple(runs), model="rigid6"), {}, {}, inputs=INPUTS))
 
 
 def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
