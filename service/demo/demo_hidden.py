@@ -7,12 +7,15 @@ from __future__ import annotations
 
 import asyncio
 import threading
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
-from abbe.service.campaign_data.campaign_folder import from_store
-from abbe.service.campaign_data.decimation import picked
+import numpy as np
+
+from abbe.models.effects.effect import Effect
+from abbe.service.campaign_data.campaign_folder import Campaign, from_store
+from abbe.service.campaign_data.decimation import picked, thinned
 from abbe.service.campaigns.measure import measure
 from abbe.service.clock import Clock, SystemClock
 from abbe.service.compensation.commission import commission
@@ -22,12 +25,15 @@ from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.demo import DemoRun, bar_rate_hz, demo_site, write_machine_file
 from abbe.service.demo.simulator_process import HiddenTruth, running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
-from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, discover, prepare, search
+from abbe.service.discovery.discover import DiscoveryJob, DiscoveryJournal, Thin, discover, prepare, search
+from abbe.service.discovery.discover_live import joined
 from abbe.service.discovery.discovery_answer import location_doc
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import book_lines, effect_lines, next_of, verdict_of
-from abbe.service.discovery.new_measurement import NewMeasurement, validate_on
+from abbe.service.discovery.finding import noise_mm_of
+from abbe.service.discovery.simulate import Simulation, simulate
 from abbe.service.domain.finding import Finding, GapUm
+from abbe.service.domain.model_book import ModelVersion
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.run import Run
 from abbe.service.effects.effect_catalogue import catalogue
@@ -36,6 +42,56 @@ from abbe.service.errors import NotObservable, TableRefused
 from abbe.service.rendering.numbers import plain
 from abbe.service.sequences.recipes.campaigns import BACK, discovery_campaign, new_measurement
 from abbe.service.storage.store import Store
+
+
+@dataclass(frozen=True)
+class NewMeasurement:
+    """The gap on all new runs together and by run, without ("before") and with ("after") the finding in the model."""
+
+    gap: GapUm
+    runs: dict[str, GapUm]
+
+
+def validate_on(
+    old: Campaign, new: Campaign, effects: tuple[Effect, ...], model: ModelVersion | None, *, thin: Thin = thinned
+) -> NewMeasurement:
+    """Predict a new campaign from an old one and the model book, and compare.
+
+    Parameters
+    ----------
+    old : Campaign
+        Campaign of the discovery. Only its identify runs are fitted.
+    new : Campaign
+        Measured later while the controller's clock kept running. Only its own set-up values are fitted: the zero of every laser run, and
+        the cup position of a new set-up.
+    model : ModelVersion, optional
+        Version of the model book with the finding. None: nothing was found, and before and after are equal.
+
+    Raises
+    ------
+    CampaignRefused
+        The data of a new run contradict its description, or it is a copy of an old one.
+    """
+    fresh = replace(new, runs=[replace(run, role="holdout") for run in new.runs])
+    both = replace(joined(old, fresh), name=old.name)  # under the old name: thermal and instrument effects of that session still apply
+    plain = simulate(prepare(both, effects, thin=thin))
+    known = plain if model is None else simulate(prepare(both, effects, model, thin=thin))
+    labels = [run.run_id for run in new.runs]
+    kinds = {run.run_id: "bar" if run.is_bar else "laser" for run in new.runs}
+    runs = {label: _gap([label], plain, known, kinds) for label in labels}
+    return NewMeasurement(_gap(labels, plain, known, kinds), runs)
+
+
+def _gap(labels: list[str], plain: Simulation, known: Simulation, kinds: dict[str, str]) -> GapUm:
+    floor = np.concatenate([np.full(known.residual_mm[k].size, noise_mm_of(known.noise_mm, kinds[k])) for k in labels])
+    before, after = ([simulation.residual_mm[k] for k in labels] for simulation in (plain, known))
+    return GapUm(before_um=_rms_um(before), after_um=_rms_um(after), floor_um=_rms_um([floor]))
+
+
+def _rms_um(parts: list[np.ndarray]) -> float:
+    values = np.concatenate(parts)
+    return 1e3 * float(np.sqrt(np.nanmean(values**2)))
+
 
 MOST = 5000
 """Number of ball-bar readings in the search: one every 2 to 6 mm of path. All readings would take four times as long."""

@@ -23,12 +23,11 @@ from abbe.service.compensation.proposals import StoredProposal, check_temperatur
 from abbe.service.compensation.recover import recovered_session
 from abbe.service.devices.session import DeviceUrls, lock_machine
 from abbe.service.discovery.changed_since import reference_solution
-from abbe.service.discovery.changed_text import changed_text
+from abbe.service.discovery.changed_text import changed_text, drift_text
 from abbe.service.discovery.discover import discover, prepare, search
 from abbe.service.discovery.discovery_states import entering
 from abbe.service.discovery.discovery_store import journal_of
 from abbe.service.discovery.discovery_text import size_text, verdict_of
-from abbe.service.discovery.linear_change import drift_text
 from abbe.service.domain.finding import Finding
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.domain.service_records import AlarmFacts, AlarmKind

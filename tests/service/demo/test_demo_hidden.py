@@ -9,9 +9,8 @@ import pytest
 
 from abbe.models.discovery.answer import Localization, Significance
 from abbe.service.campaign_data.decimation import picked
-from abbe.service.demo.demo_hidden import HiddenDemo, hidden_json, judged, truth_lines
+from abbe.service.demo.demo_hidden import HiddenDemo, NewMeasurement, hidden_json, judged, truth_lines
 from abbe.service.demo.simulator_process import HiddenTruth
-from abbe.service.discovery.new_measurement import NewMeasurement
 from abbe.service.domain.finding import EffectFound, Finding, GapUm
 from abbe.service.effects.effect_sums import _usual
 from tests.run_documents import run_of

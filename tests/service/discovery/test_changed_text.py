@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abbe.service.discovery.linear_change import largest_sure
+from abbe.service.discovery.changed_text import largest_sure
 
 
 def test_the_largest_change_beyond_its_uncertainty_is_named() -> None:
