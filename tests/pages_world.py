@@ -48,9 +48,8 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, table_image
 from abbe.service.users.people import Passwords, UserAccounts
 from abbe.service.verification import verify
-from abbe.service.web.api.sources import Sources
+from abbe.service.web.api.sources import LogTail, Sources
 from abbe.service.web.app import create_app
-from abbe.service.web.core_link.logtail import LogTail
 from abbe.service.web.listening import bind
 from abbe.service.web.login.auth_middleware import CSRF_HEADER
 from abbe.service.web.login.authentication import COOKIE, Authenticator, csrf_token

@@ -164,7 +164,7 @@ class Discovery:
     location : location of the gap of the present model (for "unknown": of the structure without a name).
     gaps : gap of the runs of each role ("identify", "holdout").
     alone : the result without any effect; given if chance may also yield names of so little evidence (`abbe.models.discovery.lack.CHANCE`).
-    left_out : gap of the fitted runs, each predicted without its block (`abbe.models.discovery.left_out`); None if there are holdout runs.
+    left_out : gap of the fitted runs, each predicted without its block (`abbe.models.discovery.agreement`); None if there are holdout runs.
     residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
     predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
     noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.

@@ -10,14 +10,13 @@ from itertools import permutations
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.discovery.agreement import agreements
+from abbe.models.discovery.agreement import agreements, left_out_gap
 from abbe.models.discovery.answer import Discovery, Gap, Localization, NamedEffect, NextTest, Verdict
 from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.experiment.additions import blind_spots, judging_run
 from abbe.models.discovery.experiment.design import SuspectEffect, propose
 from abbe.models.discovery.generic.unnamed_structures import PREFIX, is_unnamed
 from abbe.models.discovery.lack import CHANCE, Floor, floors, lack_of_fit, unexplained
-from abbe.models.discovery.left_out import left_out_gap
 from abbe.models.discovery.localization import localize_signal, locate
 from abbe.models.discovery.mixed_up import MixedUp
 from abbe.models.discovery.residues import companions, leaning, residues, shared, ties

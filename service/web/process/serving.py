@@ -20,10 +20,9 @@ from abbe.service.queries.reader import Reader
 from abbe.service.queries.status import StatusReader
 from abbe.service.storage.store import Store
 from abbe.service.users.people import UserAccounts
-from abbe.service.web.api.sources import Sources
+from abbe.service.web.api.sources import Sources, capture_log
 from abbe.service.web.app import Parts, create_app
 from abbe.service.web.core_link.core_line import CoreLine
-from abbe.service.web.core_link.logtail import capture_log
 from abbe.service.web.login.authentication import Authenticator, Endpoint
 from abbe.service.web.login.connections import TimeLimitedProtocol
 from abbe.service.web.pages.rehearsal import Rehearsals
