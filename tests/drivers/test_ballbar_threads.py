@@ -12,8 +12,9 @@ import pytest
 
 from abbe.drivers.api import BarBatch, BarSample
 from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.ballbar.frames import BarCounters, Conversation, Info
 from abbe.drivers.ballbar.stream import Stream
-from abbe.drivers.errors import LinkDown
+from abbe.drivers.errors import LinkDown, ReplyTimeout
 from abbe.drivers.links import reading
 from abbe.drivers.links.reading import ReadingThread, Ring
 from abbe.drivers.links.serial_link import ByteLink
@@ -109,3 +110,18 @@ async def test_samples_that_came_while_this_computer_stalled_are_no_silence() ->
     assert (await getting).samples[0].seq == 0
     with pytest.raises(TimeoutError):
         await stream.get(0.05)
+
+
+async def test_a_reply_that_came_while_this_computer_stalled_is_no_silence() -> None:
+    async def send(data: bytes) -> None:
+        del data
+
+    talk = Conversation("bar", send, BarCounters(), lambda: 0.05, lambda: 0.0)
+    asking = asyncio.create_task(talk.identify())
+    await asyncio.sleep(0)
+    threading.Event().wait(0.2)  # neither the loop nor the threads that read get a core, and the deadline passes
+    reply = Info(1, 0x5EED, 7, 0x0110, 2000, 0, "DBB110")
+    asyncio.get_running_loop().call_later(0.01, talk.answered, reply)
+    assert await asking is reply
+    with pytest.raises(ReplyTimeout, match="no answer within"):
+        await talk.identify()
