@@ -13,7 +13,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out, singular_values, svd
+from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, RANK_TOLERANCE, project_out, singular_values, svd, unit_columns
 
 Field = Callable[[F2], F3]
 """Function of commanded workpiece coordinates (n, 3), mm, that returns the deviation per unit of each parameter (n, 3, p)."""
@@ -82,13 +82,6 @@ def stacked(parts: list[F2], setups: list[tuple[F2, tuple[int, ...]]]) -> tuple[
             block[:, c] += values[:, k]
         blocks.append(block)
     return np.concatenate(parts), np.concatenate(blocks)
-
-
-def unit_columns(a: F2) -> tuple[F2, F1]:
-    """Scale the columns of a design to unit length and return the factors too; a column of zeros stays."""
-    norm = np.linalg.norm(a, axis=0)
-    factor: F1 = 1.0 / np.where(norm > 0, norm, 1.0)
-    return np.asarray(a * factor), factor
 
 
 def ranks(a: F2, setup: F2) -> tuple[int, int]:

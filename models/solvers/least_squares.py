@@ -267,3 +267,10 @@ def _sentence(names: tuple[str, ...], v: F1) -> Combination:
         more = f" and {len(members) - 4} more" if len(members) > 4 else ""
         text = f"{', '.join(shown[:-1])} and {shown[-1]}{more} cannot be distinguished"
     return Combination(parts, text)
+
+
+def unit_columns(a: F2) -> tuple[F2, F1]:
+    """Scale the columns of a design to unit length and return the factors too; a column of zeros stays."""
+    norm = np.linalg.norm(a, axis=0)
+    factor: F1 = 1.0 / np.where(norm > 0, norm, 1.0)
+    return np.asarray(a * factor), factor

@@ -13,8 +13,7 @@ import numpy as np
 import scipy
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.designs import unit_columns
-from abbe.models.solvers.least_squares import RANK_TOLERANCE
+from abbe.models.solvers.least_squares import RANK_TOLERANCE, unit_columns
 
 RADIUS_TOLERANCE = 0.01
 """Largest relative difference of radius and distance from the origin; if it is larger, radius or origin belong to other points."""

@@ -24,8 +24,7 @@ import scipy
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import DIRECTIONS, Term, term_values
 from abbe.models.machine import Machine
-from abbe.models.solvers.designs import unit_columns
-from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, HIDDEN, RANK_TOLERANCE, project_out, svd, taking_part
+from abbe.models.solvers.least_squares import EFFECTIVE_TOLERANCE, HIDDEN, RANK_TOLERANCE, project_out, svd, taking_part, unit_columns
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import NEAR_BEAM, STRAIGHT_MM, SetupUnknowns, bar_length_name, run_design, setup_unknowns, straight_line_of
 from abbe.models.solvers.priors import Priors
