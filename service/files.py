@@ -6,6 +6,7 @@ import errno
 import os
 import stat
 import tempfile
+from collections.abc import Callable
 from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
@@ -100,22 +101,14 @@ def replace_file(path: Path, body: bytes) -> None:
     """
     target = path.resolve()
     known = target.stat()
-    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".new", dir=target.parent)  # a new file, never one behind a link
-    beside = Path(name)
-    try:
-        with open(handle, "wb") as file:
-            os.fchmod(file.fileno(), known.st_mode & 0o7777)
-            with suppress(OSError):  # only root gives a file to another owner
-                os.fchown(file.fileno(), -1, known.st_gid)
-                os.fchown(file.fileno(), known.st_uid, -1)
-            file.write(body)
-            file.flush()
-            os.fsync(file.fileno())
-        beside.replace(target)
-    except OSError:
-        with suppress(OSError):
-            beside.unlink()
-        raise
+
+    def rights_of_old(new: int, _: Path) -> None:
+        os.fchmod(new, known.st_mode & 0o7777)
+        with suppress(OSError):  # only root gives a file to another owner
+            os.fchown(new, -1, known.st_gid)
+            os.fchown(new, known.st_uid, -1)
+
+    _swap_in(body, target, rights_of_old)
     with suppress(OSError):
         folder = os.open(target.parent, os.O_RDONLY)
         try:
@@ -132,22 +125,33 @@ def write_page(text: str | bytes, target: Path) -> None:
     FileFormatError
         The file cannot be written.
     """
-    aside: Path | None = None
     try:
         if target.is_dir():
             raise IsADirectoryError(21, "it is a folder")
-        handle, name = tempfile.mkstemp(prefix=f".{target.name}-", dir=target.parent)
-        aside = Path(name)
-        with os.fdopen(handle, "wb") as file:
-            file.write(text.encode() if isinstance(text, str) else text)
+        body = text.encode() if isinstance(text, str) else text
+        _swap_in(body, target, lambda _, new: new.chmod(0o644))  # mkstemp creates private files
+    except OSError as error:
+        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a writable folder") from None
+
+
+def _swap_in(body: bytes, target: Path, give_rights: Callable[[int, Path], None]) -> None:
+    """Write a file beside the target, flush it and rename it. Raises OSError: the target is untouched.
+
+    ``give_rights``: sets rights and owner of the new file, given as open descriptor and path.
+    """
+    handle, name = tempfile.mkstemp(prefix=f".{target.name}.", suffix=".new", dir=target.parent)  # a new file, never one behind a link
+    beside = Path(name)
+    try:
+        with open(handle, "wb") as file:
+            give_rights(file.fileno(), beside)
+            file.write(body)
             file.flush()
             os.fsync(file.fileno())
-        aside.chmod(0o644)  # mkstemp creates private files
-        aside.replace(target)
-    except OSError as error:
-        if aside is not None:
-            aside.unlink(missing_ok=True)
-        raise FileFormatError(f"{target}: cannot be written: {error.strerror}", "give a file in a writable folder") from None
+        beside.replace(target)
+    except OSError:
+        with suppress(OSError):
+            beside.unlink()
+        raise
 
 
 def may_replace(path: Path) -> bool:
