@@ -59,7 +59,7 @@ class SetupUnknowns:
     """Names and prior standard deviations of a campaign's set-up unknowns.
 
     ``start_s``: first reading of each set-up but the laser's. ``details``: what each laser run reads per unit of every set-up unknown
-    because of details of the machine (`abbe.models.solvers.details`), by label, shape (n, set-up).
+    because of details of the machine (`abbe.models.solvers.engine`), by label, shape (n, set-up).
     """
 
     names: tuple[str, ...]

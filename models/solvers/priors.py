@@ -39,7 +39,7 @@ class Priors:
     angle_rad, angle_slope_rad : one coefficient of an angle: of order 2 and more; of order 1.
     decay_order : coefficients fall with the order as 1 / (1 + (order / decay_order)^2), because machine errors are smooth.
     rough_mm, rough_rad : rough part of a translation; rough part of a rotation (orders above `SMOOTH_ORDER`): joints of rails, wear.
-    detail_mm : deviation at a place of a step test that no order follows, e.g. from the lead of a screw (`abbe.models.solvers.details`).
+    detail_mm : deviation at a place of a step test that no order follows, e.g. from the lead of a screw (`abbe.models.solvers.engine`).
     backlash_mm, cup_mm, tilt_rad, zero_mm, drift_mm_s : lost motion; cup offset; mirror tilt; error of a laser run's first record; drift of
         a laser run.
     bar_length_mm, bar_unknown_mm : length of a bar that is stated as calibrated without a figure; length of an uncalibrated bar (set with a

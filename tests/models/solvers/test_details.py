@@ -8,7 +8,7 @@ import pytest
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.machine import Machine
 from abbe.models.paths import diagonal_ends, step_diagonal, straight_line
-from abbe.models.solvers.details import MOST_PLACES, with_details
+from abbe.models.solvers.engine import MOST_PLACES, with_details
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.observe import predict, run_jacobian, setup_unknowns
 from abbe.models.solvers.priors import Priors
