@@ -13,6 +13,7 @@ from abbe.drivers.errors import DriverError
 from abbe.models.arrays import F1, F2
 from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.devices.session import Session
+from abbe.service.domain.machine import Point
 from abbe.service.domain.progress import ProgressSink
 from abbe.service.errors import AbbeError, MeasurementFault, PushNotBegun, TableRefused
 from abbe.service.runs.columns import load_run
@@ -20,7 +21,7 @@ from abbe.service.sequences.check import paced
 from abbe.service.sequences.control import Control
 from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.sequences.recipes.recipe import HelixPoints
-from abbe.service.sequences.steps import CampaignPlan, Point
+from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.site import Site
 from abbe.service.storage.store import Store
 

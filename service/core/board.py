@@ -17,12 +17,11 @@ from pathlib import Path
 from abbe.service.channel.messages import Snapshot
 from abbe.service.clock import Clock
 from abbe.service.core.jobs import JobRegistry
-from abbe.service.domain.document import TEXT, WORD
+from abbe.service.domain.document import TEXT, WORD, Doc
 from abbe.service.domain.progress import DeviceStatus, Progress, RunningCheck
 from abbe.service.domain.schedule import DueSlot, Schedule
 from abbe.service.errors import StoreError
 from abbe.service.mqtt.publisher import Publisher
-from abbe.service.scheduler.ports import Doc
 from abbe.service.verification.verified_by import VerifiedBy
 
 

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 from abbe.service.domain.artefact import Touched
 from abbe.service.domain.document import Doc, DocumentRow, HistoryRow, record
+from abbe.service.domain.machine import Point
 from abbe.service.errors import StoreError
 
 if TYPE_CHECKING:
@@ -85,9 +86,6 @@ def arc_of(points_mm: F2 | Sequence[Sequence[float]]) -> F1:
 
     steps = np.linalg.norm(np.diff(np.asarray(points_mm, dtype=np.float64), axis=0), axis=1)
     return np.concatenate(([0.0], np.cumsum(steps)))
-
-
-Point = tuple[float, float, float]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 
 from abbe.models.arrays import F2
@@ -18,9 +16,9 @@ from abbe.models.uncertainty.sources import error_sources
 from abbe.service.domain.solution_file import MonteCarloCheck, TableRow
 from abbe.service.errors import TableRefused
 from abbe.service.identification.artefact_answer import deviation_of_artefacts
+from abbe.service.identification.solve import ProgressText
 from abbe.service.identification.solve_report import Assessment, point, solution_verdict
 
-ProgressText = Callable[[str], None]
 DEVIATION_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,U_dx_um,U_dy_um,U_dz_um"
 GRID_HEADER = "x_mm,y_mm,z_mm,dx_um,dy_um,dz_um,u_dx_um,u_dy_um,u_dz_um,compensated"
 SEED, TRIALS = 101, 400_000

@@ -6,9 +6,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime
 
+from abbe.service.domain.document import Doc
 from abbe.service.domain.verification import Verification
 from abbe.service.errors import Unusable
-from abbe.service.queries.reader import Doc, Reader, finite, of_row, read_as, storable
+from abbe.service.queries.reader import Reader, finite, of_row, read_as, storable
 from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.verification.trend_table import FigureChart, FigureTrend
 from abbe.service.verification.trend_table import charts as figure_charts

@@ -20,7 +20,6 @@ from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.storage.store import Store
 
 T = TypeVar("T")
-Doc = dict[str, Any]
 MOST = 200
 """Default number of rows in a page."""
 

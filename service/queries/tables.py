@@ -9,10 +9,11 @@ from typing import TYPE_CHECKING, Literal
 from abbe.service.clock import utc_text
 from abbe.service.compensation.proposal_decisions import ProposalStatus, proposal_status
 from abbe.service.compensation.proposal_doc import Proposed, load
+from abbe.service.domain.document import Doc
 from abbe.service.domain.push_entry import PushEntry, PushState, PushTransition
 from abbe.service.domain.results import ProposalApproval, ProposalRejection
 from abbe.service.errors import NotStored, Unusable
-from abbe.service.queries.reader import Doc, Reader, StoredResult, as_stored, of_row
+from abbe.service.queries.reader import Reader, StoredResult, as_stored, of_row
 from abbe.service.storage.repositories.pages import PageRow
 from abbe.service.tables.push_journal import JournalView, TableHistory
 

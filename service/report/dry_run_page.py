@@ -6,12 +6,13 @@ import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST
+from abbe.service.domain.machine import Point
 from abbe.service.domain.run import BarSetup
 from abbe.service.rendering.document import Document, PictureBlock, Section, TextTable
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.rendering.plots.views import DrawnTest, three_views
 from abbe.service.sequences.check import DryRun
-from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, Point, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
+from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan, TouchFeature
 
 NAMES = {
     "ballbar_helix": "ball-bar helix",

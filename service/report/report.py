@@ -13,6 +13,7 @@ import numpy as np
 
 from abbe.models.compensation.tables import NineTables
 from abbe.service.campaign_data.campaign_folder import Campaign, from_folder, from_store
+from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import Rules
 from abbe.service.domain.measured import CampaignRecord, RunRecord
 from abbe.service.domain.push_entry import TERMINAL, PushEntry, PushState
@@ -28,7 +29,6 @@ from abbe.service.report import report_parts as parts
 from abbe.service.report.blocks import picture_section
 from abbe.service.report.report_discovery import discovery_report
 from abbe.service.report.report_measured import Measured, SolutionResult, campaign_report, run_report
-from abbe.service.report.report_parts import Doc
 from abbe.service.report.report_table import table_remarks
 from abbe.service.runs.columns import load_run
 from abbe.service.storage.store import Store

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from abbe.service.campaign_data.provenance import run_digest, versions
+from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import Rules
 from abbe.service.domain.run import Run
 from abbe.service.domain.verification import Verdict
@@ -18,7 +19,6 @@ from abbe.service.rendering.document import Instrument, ReportFigure, Sign
 from abbe.service.rendering.numbers import finite, plain, tidy
 from abbe.service.verification.verify import judge, overall
 
-Doc = dict[str, Any]
 NAMES = {"ballbar": "telescoping ball-bar", "laser": "laser displacement meter"}
 SIGNS: Mapping[Verdict, tuple[Sign, str]] = {
     "pass": ("ok", "Within limits"),

@@ -13,12 +13,13 @@ import structlog
 from abbe.service.audit.book import AuditBook, this_account
 from abbe.service.clock import Clock
 from abbe.service.compensation.approved import ApprovedProposal, PushOrder, next_approved
+from abbe.service.domain.document import Doc
 from abbe.service.domain.progress import JobOutcome, ProgressSink
 from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.domain.service_records import AlarmEntryRecord, AlarmFacts, AlarmKind, AuditEvent
 from abbe.service.errors import AbbeError, Aborted, MachineInUse, Stopped, StoreError
 from abbe.service.scheduler.job import FollowUp, Job, failure
-from abbe.service.scheduler.ports import Doc, SlotState
+from abbe.service.scheduler.ports import SlotState
 from abbe.service.scheduler.retrying_store import RetryingStore
 from abbe.service.sequences.control import Control
 from abbe.service.storage.store import Store

@@ -10,11 +10,11 @@ from typing import Protocol
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.document import Doc
 from abbe.service.domain.progress import Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.service_records import BEAT_S
 from abbe.service.errors import StoreError
-from abbe.service.scheduler.ports import Doc
 
 log = structlog.get_logger("abbe.heartbeat")
 

@@ -16,10 +16,11 @@ import structlog
 
 from abbe.drivers.errors import DriverError
 from abbe.service.clock import Clock
+from abbe.service.domain.document import Doc
 from abbe.service.domain.progress import JobKind, JobOutcome, Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, Aborted, Stopped
-from abbe.service.scheduler.ports import AfterCheck, Check, Doc, JobWatcher, Shelf, SlotState
+from abbe.service.scheduler.ports import AfterCheck, Check, JobWatcher, Shelf, SlotState
 from abbe.service.sequences.control import Control, State
 from abbe.service.verification import verify
 

@@ -16,11 +16,12 @@ from typing import Protocol
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.document import Doc
 from abbe.service.domain.schedule import Schedule, Window
 from abbe.service.scheduler import outcomes
 from abbe.service.scheduler.job import FollowUp, FollowUps, RunJob, carry_out
 from abbe.service.scheduler.outcomes import Hindrance, Waiting, busy, maintenance, not_ready
-from abbe.service.scheduler.ports import Doc, Readiness, SlotLedger, SlotState
+from abbe.service.scheduler.ports import Readiness, SlotLedger, SlotState
 from abbe.service.scheduler.ready import AlwaysReady
 from abbe.service.scheduler.slots import covering, next_slot, previous_slot, slots_after, time_rule
 from abbe.service.sequences.control import Control

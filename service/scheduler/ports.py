@@ -4,15 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from datetime import datetime
-from typing import Any, NamedTuple, Protocol, Self
+from typing import NamedTuple, Protocol, Self
 
+from abbe.service.domain.document import Doc
 from abbe.service.domain.progress import JobOutcome, Progress, ProgressSink
 from abbe.service.domain.schedule import Schedule
 from abbe.service.domain.verification import CheckResult
 from abbe.service.sequences.control import Control
-
-Doc = dict[str, Any]
-
 
 Check = Callable[[str, ProgressSink, Control], Awaitable[CheckResult]]
 """``check(recipe, progress, control)``: opens the devices, measures, closes them. Cancelling it must leave the machine held; ``control``

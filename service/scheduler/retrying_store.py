@@ -11,9 +11,10 @@ from typing import ParamSpec, TypeVar
 import structlog
 
 from abbe.service.clock import Clock
+from abbe.service.domain.document import Doc
 from abbe.service.domain.schedule import FIRST_UTC
 from abbe.service.errors import StoreError
-from abbe.service.scheduler.ports import Doc, OpenSlot
+from abbe.service.scheduler.ports import OpenSlot
 from abbe.service.storage.repositories.service_records import RUNNING
 from abbe.service.storage.store import Store
 from abbe.service.verification import verify

@@ -10,6 +10,7 @@ from itertools import pairwise
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
+from abbe.service.domain.machine import Point
 from abbe.service.domain.run import BarSetup
 from abbe.service.errors import StrokeError
 from abbe.service.sequences.recipes.approach import LOW_SHARE, as_point, cup_of
@@ -22,7 +23,6 @@ from abbe.service.sequences.steps import (
     MountBar,
     MountLaser,
     MoveTo,
-    Point,
     ReadBar,
     ReadLaser,
     RecordPath,

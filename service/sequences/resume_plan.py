@@ -20,6 +20,7 @@ import numpy as np
 
 from abbe.drivers.api import BarSample, ControllerStatus, bar_is_valid, on_path
 from abbe.models.arrays import F1
+from abbe.service.domain.machine import Point
 from abbe.service.domain.measured import RunPiece, arc_of
 from abbe.service.errors import RunInterrupted, SetupDisturbed, StretchDiffers
 from abbe.service.runs.pieces import LEAST_READINGS, STRETCH_MM, STRETCH_S, PathReadings, ReadProgress
@@ -31,7 +32,6 @@ from abbe.service.sequences.steps import (
     MountBar,
     MountLaser,
     MoveTo,
-    Point,
     ReadBar,
     ReadLaser,
     RecordPath,

@@ -7,9 +7,9 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from abbe.service.domain.artefact import Touched
+from abbe.service.domain.machine import Point
 from abbe.service.domain.run import AnySetup, BarSetup
 
-Point = tuple[float, float, float]
 MAX_PATH_POINTS = 8192
 """Points of the controller's path memory (docs/protocols/cnc.md, FIFO_SIZE)."""
 

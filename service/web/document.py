@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 from starlette.datastructures import MutableHeaders
 from starlette.routing import BaseRoute
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from abbe.service.domain.document import Doc
 from abbe.service.web.catalogue import HTTP
 from abbe.service.web.login.access import MUTATING, PUBLIC, Need, route_permissions
 from abbe.service.web.login.authentication import COOKIE
@@ -58,7 +58,6 @@ class SecurityHeaders:
         await self._app(scope, receive, with_headers)
 
 
-Doc = dict[str, Any]
 REF = {"$ref": "#/components/schemas/Problem"}
 UNUSED = ("HTTPValidationError", "ValidationError")
 """Schemas that FastAPI declares for 422; no route uses them."""

@@ -6,7 +6,7 @@ Stored sentences (verdicts, refusals, remarks of reports) are English; `abbe.ser
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import datetime
 from functools import cache
 from pathlib import Path
@@ -17,6 +17,8 @@ from abbe.service.web.formatting import figure_name
 NAMES: Mapping[str, str] = dict(zip(LANGUAGES, ("English", "Deutsch", "日本語", "한국어"), strict=True))
 DEFAULT = ENGLISH
 FOLDER = Path(__file__).parent / "catalogues"
+Translate = Callable[..., str]
+"""``translate(key, **values)``: the text of a key in the language of a reader."""
 SPAN_KEYS = (
     "span.s", "span.min", "span.h", "span.days", "due.in", "due.now", "ago", "job.left", "job.unknown", "lost.core", "lost.at", "login",
     "strip.stopped", "strip.nothing", "strip.failed", "strip.unreached", "strip.out",

@@ -11,6 +11,7 @@ import numpy as np
 
 from abbe.models.machine import AXES
 from abbe.models.paths import PLANES
+from abbe.service.domain.machine import Point
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.steps import (
     CampaignPlan,
@@ -19,7 +20,6 @@ from abbe.service.sequences.steps import (
     MountBar,
     MountLaser,
     MoveTo,
-    Point,
     ReadBar,
     ReadLaser,
     RecordPath,

@@ -10,9 +10,10 @@ import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import PLANES
+from abbe.service.domain.machine import Point
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth, program
-from abbe.service.sequences.steps import CampaignPlan, Point
+from abbe.service.sequences.steps import CampaignPlan
 
 USUAL_MEMORY_KIB: Mapping[str, float] = {"fanuc": 256.0, "iso": 256.0}
 """Program memory by dialect, for controls without a disk of their own, if the machine file gives none."""

@@ -18,8 +18,9 @@ from pydantic import Field as Limits
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import way_on_sphere
+from abbe.service.domain.machine import Point
 from abbe.service.domain.run import BarSetup
-from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Point, Step, TakeBarOut
+from abbe.service.sequences.steps import ChangeBar, FollowPath, MountBar, MoveTo, Step, TakeBarOut
 
 
 def one_of(*choices: str) -> AfterValidator:

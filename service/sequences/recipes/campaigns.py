@@ -20,11 +20,12 @@ import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import DIAGONALS
+from abbe.service.domain.machine import Point
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import as_point
 from abbe.service.sequences.recipes.recipe import Diagonal, Helix, Linear, Recipe
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, recipe_source, recipe_text
-from abbe.service.sequences.steps import CampaignPlan, Point
+from abbe.service.sequences.steps import CampaignPlan
 
 
 def hemisphere(machine: Machine, rel: tuple[float, float, float], share: float) -> tuple[Point, float]:

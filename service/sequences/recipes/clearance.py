@@ -11,9 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.service.domain.artefact import Obstacle
+from abbe.service.domain.machine import Point
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import Array
-from abbe.service.sequences.steps import Point, TouchFeature
+from abbe.service.sequences.steps import TouchFeature
 
 STEP_MM = 1.0
 """Largest distance between the places of a way that are checked."""

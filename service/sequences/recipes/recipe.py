@@ -30,6 +30,7 @@ from abbe.models.paths import (
     way_on_sphere,
 )
 from abbe.service.domain.document import Doc
+from abbe.service.domain.machine import Point
 from abbe.service.domain.run import parsed_setup
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.recipes.approach import (
@@ -58,7 +59,6 @@ from abbe.service.sequences.steps import (
     FollowPath,
     MountLaser,
     MoveTo,
-    Point,
     ReadBar,
     ReadLaser,
     RecordPath,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,8 +16,8 @@ from abbe.service.rendering.numbers import COVERAGE, NOT_AVAILABLE, finite, fixe
 from abbe.service.rendering.plots.bars import contribution_bars
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
+from abbe.service.web.language import Translate
 
-Translate = Callable[..., str]
 NOTHING = Markup("")
 UM = 1e6
 """Factor from mm/mm and rad to µm/m and µrad."""

@@ -12,6 +12,7 @@ from zoneinfo import ZoneInfo
 from fastapi import Query
 from fastapi.responses import HTMLResponse
 from jinja2 import Environment
+from pydantic import AfterValidator
 
 from abbe.service.domain.machine import Rules
 from abbe.service.errors import NotStored
@@ -73,6 +74,10 @@ def can_be_stored(text: str) -> str:
     if not storable(text):
         raise ValueError("the name has characters that cannot be stored")
     return text
+
+
+Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
+"""A name or another text in the query of a screen."""
 
 
 def zone_of(status: Status) -> tzinfo:

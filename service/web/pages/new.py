@@ -11,7 +11,6 @@ from typing import Annotated
 import numpy as np
 from fastapi import FastAPI, Query
 from fastapi.responses import HTMLResponse, JSONResponse
-from pydantic import AfterValidator
 
 from abbe.service.domain.document import Doc
 from abbe.service.domain.machine import Rules
@@ -27,11 +26,10 @@ from abbe.service.sequences.recipes.campaigns import USUAL_HZ
 from abbe.service.web import language
 from abbe.service.web.frame import current
 from abbe.service.web.login.access import needs
-from abbe.service.web.pages.context import Number, PageContext, can_be_stored
+from abbe.service.web.pages.context import Number, PageContext, Text
 from abbe.service.web.pages.rehearsal import CAMPAIGN, Rehearsals
 
 Recipe = Annotated[str, Query(max_length=200)]
-Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 Rate = Annotated[int, Query(ge=1, le=1000)]
 
 

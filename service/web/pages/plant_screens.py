@@ -7,12 +7,11 @@ import io
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date, datetime
-from typing import Annotated, Literal
+from typing import Literal
 from urllib.parse import urlencode
 
-from fastapi import FastAPI, Query, Request
+from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, Response
-from pydantic import AfterValidator
 
 from abbe.service.clock import utc_text
 from abbe.service.compensation.proved_levels import KIND
@@ -32,7 +31,7 @@ from abbe.service.web.frame import THEMES, current
 from abbe.service.web.login.access import needs
 from abbe.service.web.login.auth_middleware import Visit
 from abbe.service.web.page import measured
-from abbe.service.web.pages.context import PageContext, can_be_stored
+from abbe.service.web.pages.context import PageContext, Text
 from abbe.service.web.pages.diagnostics import bundle, config_of, diagnosis, megabytes
 from abbe.service.web.units import SYSTEMS
 
@@ -195,7 +194,6 @@ def _certificate(role: str, until: Mapping[str, date], today: date) -> Certifica
     return Certificate(None) if last is None else Certificate(last, (last - today).days)
 
 
-Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 Sort = Literal["worst", "machine", "due"]
 BUNDLE_ACTION = "support bundle"
 

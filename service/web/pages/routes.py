@@ -6,11 +6,9 @@ import re
 import secrets
 from collections.abc import Callable
 from functools import partial
-from typing import Annotated
 
-from fastapi import FastAPI, Query, Request
+from fastapi import FastAPI, Request
 from fastapi.responses import HTMLResponse, JSONResponse, RedirectResponse, Response
-from pydantic import AfterValidator
 
 from abbe.service.compensation.proposal_decisions import approve as work_approve
 from abbe.service.compensation.proposal_decisions import reject as work_reject
@@ -32,7 +30,7 @@ from abbe.service.web.login.login import signature_refusal
 from abbe.service.web.page import has_uplot
 from abbe.service.web.pages import times
 from abbe.service.web.pages.audit import add_audit
-from abbe.service.web.pages.context import Number, PageContext, can_be_stored, find_or_none
+from abbe.service.web.pages.context import Number, PageContext, Text, find_or_none
 from abbe.service.web.pages.proposals import MOST, outcome_texts, promise, proposal_screen, sign
 from abbe.service.web.pages.result_routes import add_result_pages
 from abbe.service.web.pages.results import discovery_screen, result_screen, solution_lines
@@ -59,7 +57,6 @@ def themed(rules: str) -> str:
 LONGEST_FORM = 4096
 LONGEST_REASON = 500
 HOURS = (1.0, 8.0, 24.0, 72.0)
-Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 PLOT_STYLE = themed(style_rules())
 
 

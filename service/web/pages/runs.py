@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -38,6 +38,7 @@ from abbe.service.verification.compare_runs import (
     remarks,
 )
 from abbe.service.web.frame import current
+from abbe.service.web.language import Translate
 from abbe.service.web.pages.context import find_or_none
 
 TESTS = ("ballbar_helix", "ballbar_circle", "laser_diagonal", "laser_linear")
@@ -116,7 +117,6 @@ def run_document(store: Store, record: RunRecord, rules: Rules) -> tuple[Run, Do
 LETTERS = "ABCD"
 LISTED = 40
 MALFORMED = (KeyError, TypeError, ValueError, IndexError)
-Translate = Callable[..., str]
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 from urllib.parse import urlencode
@@ -18,12 +18,12 @@ from abbe.service.rendering.numbers import placed, tidy
 from abbe.service.rendering.plots.slices import PLANES, SlicePlane, SliceTexts, colour_top, magnification, slice_plot, steps
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
+from abbe.service.web.language import Translate
 
 NODES = (3, 4, 5, 6)
 """Nodes per axis. More would make the table too large for a screen; the HTTP interface gives finer grids."""
 STILL, STILL_UM = "0", 1e-9
 """Text of a component that the chosen motions do not affect; largest uncertainty, µm, of such a component (rounding)."""
-Translate = Callable[..., str]
 NOTHING = Markup("")
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -17,6 +17,7 @@ from abbe.service.rendering.plots.bars import Pair, paired_bars
 from abbe.service.sequences.recipes.campaigns import hemisphere
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
+from abbe.service.web.language import Translate
 
 MEAN = "mean."
 """Prefix of scales and squarenesses that are averaged over the volume."""
@@ -26,7 +27,6 @@ UM = 1e3
 RESOLUTION_MM = 1e-7
 """Uncertainties below a tenth of a nanometre are rounding."""
 NOTHING = Markup("")
-Translate = Callable[..., str]
 
 
 @dataclass(frozen=True, slots=True)
