@@ -238,10 +238,12 @@ def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
 def summary(report: TestReport) -> str:
     """Return the abilities of the device in one line."""
     if report.failed:
-        return "it cannot be used: " + "; ".join(one.check for one in report.failed)
+        return "it cannot be used; failed: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:
         return "it can measure while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
-    return "it can only be shown: " + "; ".join(one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED)
+    return "it can be watched, but not used to measure; not proved: " + "; ".join(
+        one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED
+    )
 
 
 def _opener(text: str, about: Described | None, role: str) -> Callable[[], Awaitable[DeviceUnderTest]]:

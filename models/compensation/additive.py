@@ -39,9 +39,9 @@ Field = Callable[[F2], F3]
 def additive_design(
     solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
 ) -> tuple[F3, F3, F3]:
-    """Return the best additive field per unit of every coefficient of a solution: per axis, shape (len(grid), 3, terms).
+    """Return, for one unit of every coefficient, the additive field that fits its deviation best: per axis, shape (len(grid), 3, terms).
 
-    ``terms``: default: those of the solution; may include higher orders (`abbe.models.uncertainty.sources`).
+    ``terms``: by default those of the solution; may include higher orders (`abbe.models.uncertainty.sources`).
     """
     order = diagonal_order(solution.terms)
     field = _design_of(solution.machine, terms or solution.terms)

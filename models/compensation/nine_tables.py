@@ -50,9 +50,11 @@ def entry_u(sources: ErrorSources, per_unit: F3) -> F2:
 def table_design(
     solution: JointSolution, grids_mm: tuple[F1, F1, F1], nodes: int, terms: tuple[Term, ...] | None = None
 ) -> tuple[F3, F3, F3]:
-    """Return the best nine tables of the deviation per unit of every coefficient, first entries zero: per axis (len(grid), 3, terms).
+    """Return, for one unit of every coefficient, the nine tables that fit its deviation best: per axis an array (len(grid), 3, terms).
 
-    ``terms``: default: those of the solution; may include higher orders, which have only an uncertainty.
+    The first entry of every table is zero.
+
+    ``terms``: by default those of the solution; may include higher orders, which have only an uncertainty.
     """
     x, y, z = (effect - effect[0] for effect in additive_design(solution, grids_mm, nodes, terms))
     return x, y, z

@@ -237,7 +237,7 @@ def _judge(
     if verdict == "unknown":
         rejected += [(e.label, f"evidence {e.evidence:.0f}, below that of the structures without a name: not named") for e in effects]
     for i, j in companion.items():
-        share_text = f"evidence {found[i].score / 2.0:.0f}: possibly only the deviation of {found[j].pick.label} from its formula"
+        share_text = f"evidence {found[i].score / 2.0:.0f}: the effect may be only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))
     kept = sorted((i for i, e in mean.items() if e.label not in left), key=lambda i: -found[i].score)
     return _Judgement(tuple(kept), tuple(effects), unnamed, verdict, (*rejected, *left.items()))
@@ -246,7 +246,7 @@ def _judge(
 def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
     """Give the reason, by label, against effects that may be a part of what all findings leave without explanation (`REST_SHARE`)."""
     return {
-        e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} stays unexplained: possibly only a part of what is unexplained"
+        e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} stays unexplained: the effect may be only a part of that"
         for e in effects
         if e.evidence < REST_SHARE * rest
     }

@@ -89,7 +89,7 @@ def residues(
             share, whole = _share(small, big, big.label in scatter), max(big.evidence, without.get((big.label, small.label), 0.0))
             if small.evidence <= CLEARLY_WEAKER * big.evidence and small.evidence < share * whole:
                 share_text = f"evidence {small.evidence:.0f}, only {small.evidence / whole:.1%} of the evidence of {big.label}"
-                out[small.label] = f"{share_text}: possibly only the deviation of {big.label} from its formula"
+                out[small.label] = f"{share_text}: the effect may be only the deviation of {big.label} from its formula"
                 break
     return out
 

@@ -63,7 +63,7 @@ class SignalProjection:
 
     @classmethod
     def nothing(cls, n: int) -> SignalProjection:
-        """Return the identity, a projection that projects nothing out, with n readings of zero."""
+        """Return the projection that changes nothing, for n readings that are all zero."""
         return cls(np.zeros(n), np.zeros((n, 0)), np.ones(n), np.zeros((0, 0)), np.zeros((0, n)), np.zeros(0))
 
     @classmethod
@@ -113,7 +113,7 @@ class SignalProjection:
         return rows_of(self.left(columns), columns, prior_sd)
 
     def without(self, columns: F2, prior_sd: F1) -> SignalProjection:
-        """Return a projection that projects out more columns (n, k), too."""
+        """Return the projection that removes ``columns`` (n, k) and what this one removes; the new unknowns have independent priors."""
         rows = self.rows(columns, prior_sd)
         return replace(self, more=np.concatenate([self.more, rows]), y_coordinates=np.concatenate([self.y_coordinates, rows @ self.y]))
 

@@ -94,7 +94,7 @@ def _faults(effect: Effect, signal: Signal, paths: tuple[Path, ...], key: str, v
     if not all(np.isfinite(c).all() for c in columns):
         return ["a value is not finite"]
     out = [
-        f"blind names {p.test}, but the columns of that test are not zero"
+        f"the effect lists {p.test} in `blind`, but its columns of this test are not zero"
         for p, c in zip(paths, columns, strict=True)
         if p.test in effect.blind and c.any()
     ][:1]

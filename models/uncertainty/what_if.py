@@ -77,7 +77,10 @@ def expected_rms(known: KnownField, nodes: int) -> tuple[float, float]:
 
 
 def diagonal_figures(known: KnownField, *, clearance_mm: float = 10.0, positions: int = 11) -> list[ForecastFigure]:
-    """Range of the deviation along each of the four body diagonals of the strokes less a clearance (as in ISO 230-6)."""
+    """Range of the deviation along each of the four body diagonals (as in ISO 230-6).
+
+    The diagonals end ``clearance_mm`` inside the strokes, along every axis.
+    """
     box = known.machine.stroke_mm + np.array([clearance_mm, -clearance_mm])
     out = []
     for name in DIAGONALS:

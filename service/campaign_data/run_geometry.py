@@ -100,7 +100,7 @@ def _artefact(setup: ArtefactSetup, known: dict[str, Feature], columns: Columns)
     worst = int(np.argmax(away))
     if away[worst] <= TOLERANCE_MM:
         return None
-    place = f"feature {names[worst]}: its place by position and pose is {away[worst]:.0f} mm from its place by deviation"
+    place = f"feature {names[worst]}: position and pose place it {away[worst]:.0f} mm from where its deviation places it"
     return GeometryMistake(place, "correct its label, the pose, or deviation_x_mm, deviation_y_mm, deviation_z_mm")
 
 

@@ -110,7 +110,7 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
     try:
         return replace(tools, laser=tools.laser and has_laser, bar_lengths_mm=tools.bar_lengths_mm if has_bar else ()), tuple(messages)
     except ValueError:
-        remedy = "correct the instruments file, or name under [devices] what it lists"
+        remedy = "correct the instruments file, or add its instruments to [devices] of the machine file"
         raise ConfigError(f"nothing to measure with: {'; '.join(messages)}", remedy) from None
 
 

@@ -91,8 +91,8 @@ def simulation_doc(job: DiscoveryJob, simulation: Simulation) -> dict[str, Any]:
 def verdict_line(found: Finding) -> tuple[str, str, str]:
     """Return sign, headline and text about the gap of the present model. `abbe discover` tests whether it exceeds chance."""
     worst = max((g.before_um / g.floor_um for g in found.gaps.values() if g.floor_um > 0.0), default=1.0)
-    text = "; ".join(f"{role} runs {g.before_um:.2f} µm rms where {g.floor_um:.2f} µm is noise" for role, g in found.gaps.items())
-    text = f"{text[:1].upper()}{text[1:]}."
+    text = ", ".join(f"{g.before_um:.2f} µm rms in {role} runs (noise alone: {g.floor_um:.2f} µm)" for role, g in found.gaps.items())
+    text = f"The gap is {text}."
     if worst < AGREE:
         return "ok", "Measured and simulated agree.", text
     return "open", "Measured and simulated differ.", f"{text} abbe discover looks for what is missing."

@@ -473,7 +473,7 @@ class Run:
 
     @property
     def beam(self) -> F1:
-        """Nominal beam of a laser run, unit vector: as stated, else from start to end (of a positioning test along its axis).
+        """Nominal beam of a laser run, unit vector: as stated, else along the tested axis, else from start to end.
 
         Raises
         ------

@@ -224,7 +224,7 @@ class LegendreSeries(FileObject):
 
 
 class Spline(FileObject):
-    """B-spline, mm or rad; the end value outside knots[degree] .. knots[number of coefficients]. An extension of the format by Abbe."""
+    """B-spline, mm or rad, constant beyond knots[degree] and knots[number of coefficients]. An extension of the format by Abbe."""
 
     kind: Literal["bspline"]
     knots_mm: Numbers

@@ -32,7 +32,7 @@ STEEPEST = 64
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Write one .COM per input axis, and CONFIG.CMA with one line, which is active.
+    """Write one .COM per input axis, and CONFIG.CMA, whose only line is the active one.
 
     Raises
     ------
@@ -65,7 +65,7 @@ def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
 
 
 def assignment(names: dict[str, str]) -> TextFile:
-    """Return the .CMA that assigns a file to each axis, with one line, which is active."""
+    """Return the .CMA that assigns a file to each axis; its only line is the active one."""
     head = "NR   " + "".join(f"{a:<12}" for a in AXES) + "ACTIVE"
     row = "0    " + "".join(f"{names.get(a, ''):<12}" for a in AXES) + "*"
     return TextFile(ASSIGNMENT, "\n".join([f"BEGIN {ASSIGNMENT}", head, row, "[END]"]) + "\n")

@@ -31,7 +31,7 @@ SQUARE = ("C0Y", "B0Z", "A0Z")
 
 
 def write(comp: Compensation, settings: FormatSettings) -> tuple[TextFile, ...]:
-    """Write one .COM per axis with any motion, and CONFIG.CMA with one line, which is active.
+    """Write one .COM per axis with any motion, and CONFIG.CMA, whose only line is the active one.
 
     Raises
     ------

@@ -62,7 +62,7 @@ class VectorCase:
         return VectorCase(here, (*self.path, *keys), self._read)
 
     def has(self, key: str) -> bool:
-        """Return whether this part is an object with a key."""
+        """Return whether this part is an object that has ``key``."""
         return isinstance(self.value, dict) and key in self.value
 
     def keys(self) -> list[str]:

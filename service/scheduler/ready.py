@@ -119,7 +119,7 @@ class Ready:
         return len(self.active_s) * LOOK_S / 60.0
 
     async def watch(self) -> None:
-        """Read the controller each minute, forever, if a schedule needs a warm machine. A failed reading is not taken as work."""
+        """Read the controller each minute, forever, if a schedule needs a warm machine. After a failed reading no work is noted."""
         while self._watches:
             try:
                 self._note((await self._look(False)).status)

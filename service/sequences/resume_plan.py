@@ -7,8 +7,8 @@ been read again with the same result. An artefact resumes at the next feature, o
 While the ball-bar records, the controller's statuses show how far the axes came at constant feed (`PathProgress`). If the path is
 interrupted and bar and cup stay in place, the machine need not begin again: it drives back along the path beyond the last valid point, by a
 stretch and a lead, and comes forward again. On the lead every axis takes up its lost motion as before; on the stretch the bar must repeat
-its readings (`StretchComparison`). The runs, each up to its stretch, and the last run form one path. Readings just before the interruption
-serve only for this comparison.
+its readings (`StretchComparison`). The path is joined from the interrupted runs, each up to the start of its stretch, and the last run.
+Readings just before the interruption serve only for this comparison.
 """
 
 from __future__ import annotations

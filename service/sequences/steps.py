@@ -148,7 +148,7 @@ class TouchFeature(Touched):
         return self.at(side, self.radius_mm + (-self.search_mm if self.inside else self.search_mm))
 
     def beyond_mm(self, side: Point) -> Point:
-        """End point of a touch of this side without a contact."""
+        """Point at which the search for this side ends if the tip touches nothing."""
         return self.at(side, self.radius_mm + (self.search_mm if self.inside else -self.search_mm))
 
     def over_mm(self, side: Point) -> Point:

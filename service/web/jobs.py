@@ -29,7 +29,7 @@ REFUSALS: dict[int | str, dict[str, object]] = {
     401: {"model": Problem, "description": "No user is logged in"},
     403: {"model": Problem, "description": "The role does not allow it"},
     404: {"model": Problem, "description": "There is no such job"},
-    409: {"model": Problem, "description": "Not now: the machine measures; the job has ended, cannot pause, or asks for something else"},
+    409: {"model": Problem, "description": "The machine is in use; or the job has ended, cannot pause, or waits for another answer"},
     422: {"model": Problem, "description": "There is no such recipe, or the request is not well-formed"},
     429: {"model": Problem, "description": "Too many requests"},
     503: {"model": Problem, "description": "The core or the store does not answer"},

@@ -196,7 +196,7 @@ class NewJob(RequestBody):
 
     recipe: Annotated[str, Field(min_length=1, max_length=LONGEST_RECIPE)]
     rate_hz: Annotated[int, Field(ge=1, le=1000, description="Ball-bar samples per second; has to divide 1000")] = USUAL_HZ
-    alarm: Annotated[int, Field(ge=0, le=LARGEST, description="A full campaign looks for the cause of this alarm; 0: of no alarm")] = 0
+    alarm: Annotated[int, Field(ge=0, le=LARGEST, description="Number of the alarm whose cause a full campaign looks for; 0: none")] = 0
     resume: Annotated[
         str,
         Field(

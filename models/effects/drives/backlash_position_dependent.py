@@ -17,7 +17,10 @@ def _half(at: Places, key: str) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
 
 
 def unequal(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return columns of mean width and change along x, -s/2 and -s x/2 times 1 um: s direction of motion, x = -1 .. +1 over the stroke."""
+    """Return two columns: mean width, -s/2 times 1 um, and its change over the stroke, -s x/2 times 1 um.
+
+    ``s`` is the direction of motion (+1 or -1), ``x`` the position, -1 to +1 over the stroke.
+    """
     a = axis_of(key)
     x = share_of_stroke(at.q_mm[:, a], path.machine.stroke_mm[a])
     return along(a, _half(at, key), _half(at, key) * x)

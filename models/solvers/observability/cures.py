@@ -183,7 +183,9 @@ def _certificates(known: Knowledge, names: tuple[str, ...]) -> list[Addition]:
         out.append(Addition("bar", cause, "a calibrated bar", knows=lengths))
     if tilts := tuple(n for n in names if n.startswith("tilt_") and n not in known.fixed):
         out.append(
-            Addition("tilt", "the tilt of the mirror is unknown and gives the same readings", "a mirror of measured tilt", knows=tilts)
+            Addition(
+                "tilt", "an unknown tilt of the mirror gives the same readings as these errors", "a mirror of measured tilt", knows=tilts
+            )
         )
     return out
 

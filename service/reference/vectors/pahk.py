@@ -113,7 +113,7 @@ def _tables(part: VectorCase) -> Triple:
 
 
 def read_volumetric(case: VectorCase, checks: Checks) -> None:
-    """Compare every deviation of every type."""
+    """Compare every deviation of every type with the computed one."""
     for name, part in case.at("types").items():
         kind = pahk_type(name)
         ours, theirs = kind.chain.replace("-", "").removeprefix("w").removesuffix("t").replace("b", "F"), part.text("chain")
@@ -135,7 +135,7 @@ def _point(kind: PahkType, point: VectorCase, checks: Checks) -> None:
 
 
 def read_random(case: VectorCase, checks: Checks) -> None:
-    """Compare RX, RY, RZ of every case, at the coverage factor of the inputs."""
+    """Compare RX, RY, RZ of every case with the computed ones, at the coverage factor of the inputs."""
     for name, part in case.at("types").items():
         for point in part.parts():
             axes, probe, given = point.array("X", shape=(3,))[None], point.array("probe", shape=(3,)), point.at("R")
@@ -148,7 +148,10 @@ def read_random(case: VectorCase, checks: Checks) -> None:
 
 
 def read_diagonals(case: VectorCase, checks: Checks) -> None:
-    """Compare both forms of every diagonal; each function is zero at the start of its axis and has the given value at full travel."""
+    """Compare both forms of every diagonal with the computed ones.
+
+    Each function is zero at the start of its axis and has the given value at full travel.
+    """
     volume = case.array("volume", shape=(3,))
     for name, part in case.at("types").items():
         given = part.at("value_at_full_travel")

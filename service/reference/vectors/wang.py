@@ -62,7 +62,7 @@ CURVES = tuple(i + a for a in "XYZ" for i in "XYZ")
 
 
 def read(case: VectorCase, checks: Checks) -> None:
-    """Compare every case, then squareness, ranks and the demonstration."""
+    """Compare every case of the file with computed numbers, then its squareness, ranks and demonstration."""
     n = case.whole("n")
     inc = case.array("inc", shape=(3,))
     for _ in case.at("compensation_demo").named("metric", *DEMO_PLANS):

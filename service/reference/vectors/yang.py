@@ -94,7 +94,7 @@ def errors_of(part: VectorCase) -> YangErrors:
 
 
 def read_helix(case: VectorCase, checks: Checks) -> None:
-    """Compare points, exact and linear readings, and both fits of every set."""
+    """Compare points, exact and linear readings, and both fits of every set with those of the file."""
     truth = SixParameters(*(case.number("truth", k) for k in NAMES))
     origin, turns = case.array("origin", shape=(3,)), case.number("turns")
     spacing = case.text("spacing")
@@ -127,7 +127,10 @@ def _helix_readings(part: VectorCase, checks: Checks, truth: SixParameters, poin
 
 
 def read_conditioning(case: VectorCase, checks: Checks) -> None:
-    """Compare every key; each kind must occur: ``six_<law>_<turns>``, ``ten_<turns>``, ``corr9_<turns>turns``, ``two_radii``."""
+    """Compare the numbers of every key with computed ones.
+
+    Each kind of key must occur: ``six_<law>_<turns>``, ``ten_<turns>``, ``corr9_<turns>turns``, ``two_radii``.
+    """
     for kind in KINDS:
         if not any(key.startswith(kind) for key, _ in case.items()):
             raise FileFormatError(f"{case.label}: there is no key {kind}...", LAYOUT)
@@ -185,7 +188,7 @@ def _two(case: VectorCase, checks: Checks) -> None:
 
 
 def read_ranks(case: VectorCase, checks: Checks) -> None:
-    """Compare the plan in ``assumed``, the ranks of every experiment and degree, and the listed null vectors."""
+    """Compare origins and coefficients of the plan, ranks of every experiment and degree, and null vectors with those of the file."""
     assumed = case.at("assumed")
     plans = [plan_of(assumed, d + 1) for d in range(len(case.at("N").parts()))]
     stroke = np.stack([np.zeros(3), plans[0].travel_mm], axis=1)

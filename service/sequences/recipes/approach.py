@@ -196,7 +196,7 @@ def along_sphere(cup: Cup, start_mm: Point, end_mm: Point, feed_mm_min: float) -
 
 
 def cup_of(setup: BarSetup) -> Cup:
-    """Return the sphere of a planned ball-bar test."""
+    """Return the sphere of a planned ball-bar test, and the direction in which its cup opens."""
     up = np.zeros(3)
     up[AXES.index(setup.axis)] = float(setup.opens or 1)
     return Cup(setup.centre_mm, setup.radius_mm, up)

@@ -145,8 +145,8 @@ def check_clear(
                 gaps = np.where(meant, np.inf, gaps)
                 if gaps.size and gaps.min() < margin_mm:
                     raise ConfigError(
-                        f"artefact {artefact}, feature {one.feature}: on its way to it {part.name} comes within {gaps.min():.1f} mm of "
-                        f"{some.names[int(np.argmin(gaps))]}",
+                        f"artefact {artefact}, feature {one.feature}: {part.name} comes within {gaps.min():.1f} mm of "
+                        f"{some.names[int(np.argmin(gaps))]} on the way there",
                         "raise clear_mm, use a smaller or longer stylus or a smaller search_mm, move the clamp, or leave the feature out",
                     )
 

@@ -32,9 +32,7 @@ Motion = Literal[
     "EXX", "EYX", "EZX", "EAX", "EBX", "ECX", "EXY", "EYY", "EZY", "EAY", "EBY", "ECY",
     "EXZ", "EYZ", "EZZ", "EAZ", "EBZ", "ECZ", "C0Y", "B0Z", "A0Z",
 ]  # fmt: skip
-Motions = Annotated[
-    list[Motion], Query(max_length=21, description="The map shows the joint effect of these motions; none: of all motions.")
-]
+Motions = Annotated[list[Motion], Query(max_length=21, description="Motions whose joint effect the map shows; none given: all motions.")]
 
 
 def _no_number(value: object) -> object:

@@ -82,7 +82,7 @@ def test_what_two_related_names_share_belongs_to_the_stronger_one() -> None:
     assert ties(pair, SCATTER, without) == frozenset()
     assert told == {
         "laser_cosine": "evidence 3, only 1.4% of the evidence of air_refraction: "
-        "possibly only the deviation of air_refraction from its formula"
+        "the effect may be only the deviation of air_refraction from its formula"
     }
 
 

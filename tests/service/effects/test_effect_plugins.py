@@ -75,7 +75,7 @@ def test_an_effect_of_another_package_is_found_and_another_beside_it_too(site: P
         (GOOD.format(name="clamp_step", slope=1.0).replace('unit="um"', 'unit="parsec"'), "unit 'parsec'"),
         (
             GOOD.format(name="clamp_step", slope=1.0).replace("source=", 'blind=("laser_diagonal",), source='),
-            "blind names laser_diagonal",
+            "the effect lists laser_diagonal in `blind`",
         ),
     ],
 )

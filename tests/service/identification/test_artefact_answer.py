@@ -85,7 +85,7 @@ def test_a_label_that_contradicts_the_position_of_its_point_is_refused(tmp_path:
     names = run["columns"]["feature"]
     names[7], names[9] = names[9], names[7]
     path.write_text(json.dumps(run))
-    with pytest.raises(CampaignRefused, match="run p2: feature E2: its place by position and pose is 111 mm from its place by deviation"):
+    with pytest.raises(CampaignRefused, match="run p2: feature E2: position and pose place it 111 mm from where its deviation places it"):
         CliRunner().invoke(app, ["solve", str(folder)], catch_exceptions=False)
     names[7], names[9] = names[9], names[7]
     run["setup"]["pose"]["origin_mm"] = [0.0, 0.0, 0.0]  # not stated: the solution fits it
