@@ -88,7 +88,8 @@ class Effect:
     forms : tuple of Form
     unseen : tuple of float
         Ratio of the whole strength to the strength of the columns, and its standard uncertainty. The ratio differs from 1 if the present
-        model absorbs a part of the effect (e.g. the line of a straightness); the stated strength includes this part.
+        model absorbs a part of the effect (e.g. the line of a straightness), or if a campaign ends before it (the slow part of a warm-up);
+        the stated strength includes this part.
     kind : "mean" | "variance"
         Whether the effect shifts the readings or adds noise (stick-slip, vibration with an unknown phase, outliers). The columns of a
         "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.

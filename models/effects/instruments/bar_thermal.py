@@ -5,9 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F2
-from abbe.models.effects.columns import NO_KEY, STEEL_PER_K, first, of_kind
+from abbe.models.effects.columns import NO_KEY, STEEL_PER_K, first, of_kind, per_setup
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path
+
+HANDLED_K = 0.05
+"""Unit of the differences between the set-ups, K: small against the excess that they have in common, which stays the mean."""
 
 
 def _cooling(path: Path, tau_s: float) -> F2:
@@ -25,6 +28,11 @@ def _second_time(path: Path, key: str, values: Values) -> F2:
     return np.concatenate([_cooling(path, values["tau_s"] / 3.0) - now, _cooling(path, values["tau_s"] * 3.0) - now], axis=1)
 
 
+def _handled(path: Path, values: Values) -> F2:
+    """Return the same for `HANDLED_K`: every set-up is handled anew, so each begins with another excess."""
+    return HANDLED_K * _cooling(path, values["tau_s"])
+
+
 EFFECT = Effect(
     name="bar_thermal",
     title="thermal state of the ball-bar",
@@ -36,7 +44,7 @@ EFFECT = Effect(
     shape=(Parameter("tau_s", "s", 150.0, 4000.0, 900.0, "minutes after handling", (250.0, 600.0, 1500.0)),),
     signal=of_kind("bar", relaxing, 1),
     strength=first,
-    forms=(Form("second time constant", of_kind("bar", _second_time, 2)),),
+    forms=(Form("per set-up", per_setup("bar", 1, _handled)), Form("second time constant", of_kind("bar", _second_time, 2))),
     needs="several runs per set-up, spread over ten minutes and more",
     signature="all readings of a set-up relax together from the moment it was mounted",
     remedy="set-up",

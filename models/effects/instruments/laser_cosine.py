@@ -10,7 +10,7 @@ from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path
 
 
-def scaled(path: Path) -> F2:
+def scaled(path: Path, values: Values) -> F2:
     """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2."""
     return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.effects.columns import NO_KEY, PPM, per_setup, setup_length
-from abbe.models.effects.effect import Effect
+from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path
 
 
@@ -17,7 +17,7 @@ def across(beam: F1) -> F2:
     return np.stack([one, np.cross(beam, one)])
 
 
-def tilted(path: Path) -> F2:
+def tilted(path: Path, values: Values) -> F2:
     """Return 1 urad times the displacement across the beam since the first record, in two directions: two coefficients per laser set-up."""
     return np.asarray(PPM * (path.at.q_mm - path.reference.q_mm) @ across(path.look[0]).T)
 

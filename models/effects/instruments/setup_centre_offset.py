@@ -6,11 +6,11 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.effects.columns import NO_KEY, UM, per_setup, setup_length
-from abbe.models.effects.effect import Effect
+from abbe.models.effects.effect import Effect, Values
 from abbe.models.effects.path import Path
 
 
-def offset(path: Path) -> F2:
+def offset(path: Path, values: Values) -> F2:
     """Return minus the bar's direction for an offset of 1 um in X, Y, Z: three coefficients per ball-bar set-up."""
     return np.asarray(-UM * path.look)
 

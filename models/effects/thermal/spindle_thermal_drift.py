@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, UM, along, axis_of, first, of_places, warmth, with_sensor
+from abbe.models.effects.columns import AXIS_KEYS, CAMPAIGN_S, UM, WITH_SLOW, along, axis_of, first, of_places, warmth, with_sensor
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
@@ -34,6 +34,7 @@ EFFECT = Effect(
     shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "minutes to two hours", (900.0, 2500.0, 7000.0)),),
     signal=of_places(drift),
     strength=first,
+    unseen=WITH_SLOW,
     forms=(Form("second time constant", of_places(_second_time)), Form("sensor", with_sensor(_sensed, lambda key: "spindle"))),
     needs="a long set-up without a new zero, early in the warm-up",
     signature="the centre drifts within one set-up, equally at all positions",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abbe.models.arrays import F1, F3
-from abbe.models.effects.columns import CAMPAIGN_S, PPM, VISITED, along, first, of_strokes, share_of_stroke, warmth
+from abbe.models.effects.columns import CAMPAIGN_S, PPM, VISITED, WITH_SLOW, along, first, of_strokes, share_of_stroke, warmth
 from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
@@ -47,6 +47,7 @@ EFFECT = Effect(
     shape=(Parameter("tau_s", "s", *CAMPAIGN_S, 3600.0, "as for the growth of axes", (900.0, 2500.0, 7000.0)),),
     signal=of_strokes(leaning),
     strength=first,
+    unseen=WITH_SLOW,
     forms=(Form("second time constant", of_strokes(_second_time)), Form("bent", of_strokes(_bent))),
     needs="an early run repeated late; laser diagonals, to separate it from the growth of one axis",
     signature="an oval at 45 degrees that drifts from run to run",

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 from numpy.polynomial import legendre
 
+from abbe.models.arrays import F1
 from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.finding import TIME_TRUE_TO_FORM, shape_of, strength_of, true_to_form
 from abbe.models.effects.catalogue import CATALOGUE
-from abbe.models.effects.columns import WITH_CONSTANT, WITH_LINE
+from abbe.models.effects.columns import WITH_CONSTANT, WITH_LINE, WITH_SLOW
 from abbe.models.effects.effect import Form
 
 BY_NAME = {e.name: e for e in CATALOGUE}
@@ -44,6 +45,32 @@ def test_what_a_curves_seen_part_leaves_out_is_as_large_as_stated(
     assert np.quantile(ratio, [0.16, 0.84]) == pytest.approx([low, high], rel=0.15)
     ratio_claimed, u = claim
     assert np.mean(np.abs(ratio - ratio_claimed) < 2.0 * u) > 0.8
+
+
+def short_of_the_end(offset: bool, count: int = 300) -> F1:
+    """Final size of a warm-up with two time constants over that of the one exponential that fits 160 minutes of it best."""
+    rng, t, out = np.random.default_rng(6), np.linspace(600.0, 9500.0, 40), []
+    for _ in range(count):
+        tau, slow, share = rng.uniform(1200.0, 6000.0), np.exp(rng.choice([-1, 1]) * rng.uniform(0.6, 1.4)), rng.uniform(0.15, 0.6)
+        rise = 1.0 - (1.0 - share) * np.exp(-t / tau) - share * np.exp(-t / (slow * tau))
+        tried = []
+        for one in np.geomspace(300.0, 10000.0, 60):
+            columns = np.column_stack([-np.expm1(-t / one), np.ones(t.size)])[:, : 1 + offset]
+            c, *_ = np.linalg.lstsq(columns, rise, rcond=None)
+            tried.append((float(np.sum((rise - columns @ c) ** 2)), 1.0 / float(c[0])))
+        out.append(min(tried)[1])
+    return np.array(out)
+
+
+def test_a_warm_up_ends_as_much_above_its_exponential_as_stated() -> None:
+    ratio, u = WITH_SLOW
+    for short in (short_of_the_end(True), short_of_the_end(False)):
+        assert np.median(short) == pytest.approx(ratio, abs=0.03)
+        assert np.mean(np.abs(short - ratio) < 2.0 * u) > 0.85
+    (c, values), plain = (np.array([40.0]), {"tau_s": 3000.0}), np.ones((6, 1))
+    effect = BY_NAME["spindle_thermal_drift"]
+    strength, _ = strength_of(problem_of({effect.signal: plain}), Pick(effect, "X", values), c, np.zeros((1, 1)))
+    assert strength == pytest.approx(40.0 * ratio)
 
 
 def test_straightness_is_stated_with_its_line_and_says_how_unsure_that_is() -> None:

@@ -14,6 +14,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.drives import vibration
 from abbe.models.effects.effect import Effect
+from abbe.models.effects.instruments.bar_thermal import HANDLED_K
 from abbe.models.effects.path import Path
 from abbe.models.effects.self_test import CENTRE_MM, DEAD_PATH_MM, MACHINE, corners, declaration_faults, probe_paths, signal_faults
 from abbe.models.geometry.bases import smooth_terms
@@ -170,6 +171,18 @@ def test_lateral_play_of_an_axis_at_rest_is_a_shift_of_unknown_size() -> None:
     for path, columns, plain, rests in zip(PATHS, form.signal(PATHS, "EXZ", {}), of("lateral_play", "EXZ"), still, strict=True):
         np.testing.assert_allclose(columns[:, 0], 0.5e-3 * rests * path.look[:, 0])
         assert not (rests and plain.any())
+
+
+def test_every_set_up_of_a_bar_held_in_the_hand_may_begin_with_another_excess() -> None:
+    """The form has one column for each set-up: the cooling of the bar in its runs, and nothing elsewhere."""
+    form = next(f for f in BY_NAME["bar_thermal"].forms if f.name == "per set-up")
+    setups = sorted({p.setup for p in PATHS if p.kind == "bar"})
+    assert len(setups) > 1
+    for path, own, plain in zip(PATHS, form.signal(PATHS, "", {"tau_s": 700.0}), of("bar_thermal", "", tau_s=700.0), strict=True):
+        assert own.shape == (path.n, len(setups))
+        mine = np.array([path.setup == s for s in setups])
+        np.testing.assert_allclose(own[:, mine].sum(axis=1) * (path.kind == "bar"), HANDLED_K * plain[:, 0])
+        assert not own[:, ~mine].any()
 
 
 def test_a_bed_turns_over_across_the_other_axis() -> None:
