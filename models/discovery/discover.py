@@ -16,17 +16,14 @@ from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidate_bank import Pick
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.finding import doubted, finding
-from abbe.models.discovery.instrument_noise import unscaled
 from abbe.models.discovery.lack import CHANCE
 from abbe.models.discovery.mixed_up import mixed_up, wrong_tool
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
-from abbe.models.discovery.solved_model import predictions, solve
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, creeping, extra_variance, rough_place
+from abbe.models.discovery.solved_model import predictions, solve, whole_rest
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance, rough_place, teeth_mm2
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
 
-MOST_GATED = 0.35
-"""Readings with scatter from stick-slip are excluded from the search for mean effects, unless they reach this share of all readings."""
 Progress = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
@@ -38,28 +35,21 @@ ROUNDS = 3
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
     """Find variance effects in the residuals of simulation and ``picks``; single laser outliers are included here."""
     solved = solve(problem, picks)
-    model = problem.tangent.raw @ (solved.theta - problem.theta)
-    for pick, c in zip(solved.picks, solved.coefficients, strict=True):
-        model = model + pick.raw(problem) @ c
-    valid = np.concatenate([r.valid.astype(float) for r in problem.runs])
-    left = (problem.gap - model) * valid
-    white = unscaled(left[:, None], problem.lengths, problem.kinds, problem.colours)[:, 0] / problem.sd_mm()
+    white = whole_rest(problem, solved)
     sigma = tuple(problem.colours[k].sd_mm for k in problem.kinds)
     leverage = tuple(problem.by_run(problem.projection.leverage))
     alone = tuple(problem.by_run(1.0 - problem.lone(white * problem.sd_mm())))
-    rest = tuple(problem.by_run(white * valid))
-    return extra_variance(problem.paths, rest, sigma, leverage=leverage, colours=problem.colours, alone=alone)
+    return extra_variance(problem.paths, tuple(problem.by_run(white)), sigma, leverage=leverage, colours=problem.colours, alone=alone)
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """Remove variance effects: project vibrations out of each ball-bar run, and give weight 0 to readings with excess scatter."""
+    """Remove variance effects: project vibrations out of each ball-bar run, and weight readings with excess scatter down."""
     waves, use = [problem.also], problem.use
     for f in findings:
         if f.name == "vibration":
             waves.append(_waves(problem, "XYZ".index(f.key), f.parameters["frequency_hz"]))
         elif f.name == "stick_slip":
-            loud = creeping(problem.paths, f)
-            use = use * (1.0 - loud) if loud.mean() < MOST_GATED else use
+            use = use / np.sqrt(1.0 + teeth_mm2(problem.paths, f) / np.square(problem.sd_mm()))
         elif f.name == "unnamed_rough":
             there = np.concatenate(rough_place(problem.paths, f.key))
             use = use * np.where(there > 0, 1.0 / f.parameters["times"], 1.0)
@@ -135,10 +125,10 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
         tell("comparing again what is left", 0.5 + 0.15 * i)
         labels = {f.pick.label for f in found} | {f.label for f in loud}
         named = [f.pick for f in found if not f.pick.unnamed]
-        loud = _merged(loud, scattered(problem, named))
+        loud, known = _merged(loud, scattered(problem, named)), len(loud)
         if renewed := i == 0 or labels != _labels(found, loud):
             contest.banks.clear()  # they would take as much memory as those of the new problem
-            problem = without(settled(problem, [f.pick for f in found]), loud)
+            problem = without(settled(problem, [f.pick for f in found]), loud[known:])
         if not found and not loud and not any(c.gain for c in problem.colours.values()):
             break
         if not renewed and [p.start for p in named] == [p.start for p in start]:
@@ -180,7 +170,7 @@ def _labels(found: list[Selection], loud: tuple[VarianceFinding, ...]) -> set[st
 
 
 def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) -> tuple[VarianceFinding, ...]:
-    """Return the old findings and those of the new ones that have other labels."""
+    """Return the old findings, then those of the new ones that have other labels."""
     known = {f.label for f in old}
     return (*old, *(f for f in new if f.label not in known))
 

@@ -116,6 +116,16 @@ def _fit(problem: WhitenedProblem, raw: Sequence[F2], sd: Sequence[F1]) -> Solve
     return SolvedModel((), x[:n], inverse[:n, :n], tuple(x[p] for p in parts), blocks, ())
 
 
+def whole_rest(problem: WhitenedProblem, solved: SolvedModel) -> F1:
+    """Return the whitened residuals of all valid readings, with or without weight (`WhitenedProblem.use`), and exact zeros for others."""
+    model = problem.tangent.raw @ (solved.theta - problem.theta)
+    for pick, c in zip(solved.picks, solved.coefficients, strict=True):
+        model = model + pick.raw(problem) @ c
+    valid = np.concatenate([r.valid.astype(float) for r in problem.runs])
+    left = (problem.gap - model) * valid
+    return np.asarray(problem.white_all(left[:, None])[:, 0] * valid)
+
+
 def predictions(problem: WhitenedProblem, solved: SolvedModel) -> dict[str, F1]:
     """Predict the readings of every run, sealed runs included, mm; set-up unknowns that no identify run determines are zero."""
     parts = shares(problem, solved)

@@ -169,7 +169,11 @@ class WhitenedProblem:
 
     def white(self, columns: F2) -> F2:
         """Whiten columns (n, k), mm, to unit noise; readings that are left out become zero."""
-        out = unscaled(columns * self.use[:, None], self.lengths, self.kinds, self.colours)
+        return self.white_all(columns * self.use[:, None])
+
+    def white_all(self, columns: F2) -> F2:
+        """Whiten columns (n, k), mm, to unit noise, also in readings that are left out."""
+        out = unscaled(columns, self.lengths, self.kinds, self.colours)
         out /= self.sd_mm()[:, None]
         return out
 

@@ -7,7 +7,7 @@ windows), so that noise alone leads to a given name in less than 3 of 1000 campa
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -17,7 +17,16 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.instrument_noise import Colour
 from abbe.models.discovery.localization import localize_signal
-from abbe.models.discovery.variance.spectrum import ALIKE, FEW, fast, gated_roughness, line_of_axis, loud_windows, roughness_of
+from abbe.models.discovery.variance.spectrum import (
+    ALIKE,
+    FEW,
+    fast,
+    gated_roughness,
+    line_of_axis,
+    loud_windows,
+    roughness_of,
+    tooth_variance,
+)
 from abbe.models.effects.path import Path
 from abbe.models.machine import AXES
 
@@ -221,9 +230,11 @@ def candidates(
         quick = tuple(fast(p, r) for p, r in zip(bar_paths, kept, strict=True))
         for axis in range(3):
             out += _vibration(axis, bar_paths, quick, sigma, (colours or {}).get("bar"))
-        out += _stick_slip(bar_paths, kept, sigma)
+        sticking = _stick_slip(bar_paths, kept, sigma)
+        teeth = np.any([np.zeros(sum(p.n for p in bar_paths)), *(creeping(bar_paths, f) for f in sticking if f.evidence > 0.0)], axis=0)
+        out += sticking
         out += _burst(bar_paths, kept, sigma)
-        out += _bar_scatter(bar_paths, tuple(even[k] for k in bars), off, sigma)
+        out += _bar_scatter(bar_paths, tuple(even[k] for k in bars), off, sigma, teeth)
     lasers = [k for k, p in enumerate(paths) if p.kind == "laser"]
     if sum(paths[k].n for k in lasers) >= LEAST_LASER:
         subset = tuple(paths[k] for k in lasers), tuple(even[k] for k in lasers), tuple(sigma_mm[k] for k in lasers)
@@ -279,7 +290,14 @@ def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[f
 def creeping(paths: tuple[Path, ...], found: VarianceFinding) -> F1:
     """Return 1 for ball-bar readings that a stick-slip makes scatter (`GATE`), else 0, stacked over the runs, shape (n,)."""
     axis, fast_mm_s = AXES.index(found.key), GATE * found.parameters["v_c"]
-    return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < fast_mm_s) * float(p.kind == "bar") for p in paths])
+    moves = (float(p.kind == "bar" and np.ptp(p.at.q_mm[:, axis]) > 0) for p in paths)
+    return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < fast_mm_s) * m for p, m in zip(paths, moves, strict=True)])
+
+
+def teeth_mm2(paths: Sequence[Path], found: VarianceFinding) -> F1:
+    """Return the variance that a stick-slip adds to every ball-bar reading, mm^2, stacked over the runs, shape (n,)."""
+    bar = np.repeat([float(p.kind == "bar") for p in paths], [p.n for p in paths])
+    return bar * tooth_variance(paths, AXES.index(found.key), found.parameters["v_c"]) * (found.strength / UM) ** 2 / 3.0
 
 
 def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
@@ -291,15 +309,22 @@ def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
     )
 
 
-def _bar_scatter(paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
-    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); only the place if it holds most of these."""
+def _bar_scatter(
+    paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...], teeth: NDArray[np.bool_]
+) -> list[VarianceFinding]:
+    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); only the place if it holds most of these.
+
+    Readings that a stick-slip makes scatter (``teeth``, stacked over the runs) are not wrong: a tooth that is one reading long looks alike.
+    """
     found = _rough_places(paths, tuple(np.clip(r, -CLIPPED, CLIPPED) for r in rest), sigma_mm)
     if found and found[0].evidence > 0.0:
         there = np.concatenate(rough_place(paths, found[0].key))
         wrong = np.concatenate(off)
         if float(there @ wrong) > MOSTLY * float(wrong.sum()):
             return found
-    return [*found, *_bar_outliers(paths, tuple(r * o for r, o in zip(rest, off, strict=True)), sigma_mm)]
+    calm = np.split(~teeth, np.cumsum([p.n for p in paths])[:-1])
+    wrong_only = tuple(r * o * c for r, o, c in zip(rest, off, calm, strict=True))
+    return [*found, *_bar_outliers(paths, wrong_only, int((~teeth).sum()), sigma_mm)]
 
 
 def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
@@ -342,15 +367,15 @@ def _two_levels(runs: list[tuple[F1, NDArray[np.bool_]]]) -> tuple[float, float]
     return gain, float(np.sqrt(a / b))
 
 
-def _bar_outliers(paths: tuple[Path, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
+def _bar_outliers(paths: tuple[Path, ...], off: tuple[F1, ...], readings: int, sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
     """Name single wrong readings of a ball-bar if there are at least `LEAST_OFF`.
 
     ``off``: whitened residuals of these readings (`abbe.models.discovery.instrument_noise.lone`), one array (n,) per run, all others zero.
+    ``readings``: number of readings among which they were looked for.
     The evidence compares normal noise with noise as wide as these readings.
     """
     sizes = np.concatenate([o[o != 0.0] * s for o, s in zip(off, sigma_mm, strict=True)])
     sigmas = np.concatenate([o[o != 0.0] for o in off])
-    readings = sum(p.n for p in paths if p.kind == "bar")
     if sizes.size < LEAST_OFF:
         return []
     width = float(np.sqrt(np.mean(sigmas**2)))

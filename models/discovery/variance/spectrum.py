@@ -6,6 +6,7 @@ are rough while an axis creeps (stick-slip), or for some seconds of one run (int
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -26,8 +27,8 @@ REGULAR = 0.02
 """Sampling counts as regular when its steps differ by less than this fraction."""
 TOP = 24
 GATES_MM_S = (0.7, 0.9, 1.15, 1.45, 1.8, 2.25, 2.8, 3.5, 4.4)
-REFINED = 2
-"""Number of gates with the best scores that are fitted."""
+REFINED, WORTH = 2, 7.0
+"""Number of gates with the best scores that are fitted; all gates are fitted if the better one gains more than `WORTH`."""
 LEAST_READINGS = 12.0
 """A gate with fewer effective readings is not tried."""
 ALIKE = 1.94
@@ -172,8 +173,8 @@ def _amplitude(spectra: list[_Spectrum], f: float) -> tuple[float, float, float]
 class Roughness:
     """Stick-slip of one axis, found by a gate: a weight for each reading that falls as the axis moves faster.
 
-    ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: gate speed, mm/s. ``size_mm``: half height of a saw-tooth.
-    ``weight``: square root of the weights, by run.
+    ``gain``: gain in log likelihood. ``tried``: number of gates tried. ``v_c``: gate speed, mm/s. ``size_mm``: half height of a saw-tooth;
+    ``u_mm``: its standard uncertainty. ``weight``: square root of the weights, by run.
     """
 
     gain: float
@@ -184,31 +185,60 @@ class Roughness:
     weight: tuple[F1, ...]
 
 
+def tooth_variance(paths: Sequence[Path], axis: int, v_c: float) -> F1:
+    """Return the variance of a stick-slip in every reading, relative to that of an axis that creeps along the bar, shape (n,).
+
+    A saw-tooth decreases with speed as exp(-(v/v_c)^2) (Stribeck's curve; ``v_c``, mm/s); a run in which the axis does not move has none.
+    """
+    moving = (np.where(np.ptp(p.at.q_mm[:, axis]) > 0, np.abs(p.at.v_mm_s[:, axis]), np.inf) for p in paths)
+    look = np.concatenate([p.look[:, axis] for p in paths])
+    return np.asarray(np.square(look) * np.exp(-2.0 * np.square(np.concatenate([*moving]) / v_c)))
+
+
 def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> dict[int, Roughness]:
     """Find for each axis the most likely speed below which the readings are rougher; axes that never creep are left out.
 
-    A saw-tooth of half height h decreases with speed as exp(-(v/v_c)^2) (Stribeck's curve) and has the variance h^2/3. Scatter along each
-    axis at any speed is fitted too, because a vibration is not stick-slip. Deviations that are equal in neighbouring readings are left
-    out: they may be residues of the mean model at a reversal.
+    A saw-tooth of half height h has the variance h^2/3 times `tooth_variance`. Scatter along each axis at any speed is fitted too, because
+    a vibration is not stick-slip. Deviations that are equal in neighbouring readings are left out: they may be residues of the mean model
+    at a reversal.
     """
-    look = np.concatenate([p.look**2 / s**2 for p, s in zip(paths, sigma_mm, strict=True)])
+    noise = np.repeat(np.square(sigma_mm), [p.n for p in paths])
+    look = np.concatenate([p.look**2 for p in paths]) / noise[:, None]
     values = np.concatenate(rest)
     read = values != 0.0
     fits = tuple(_RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([roughness_of(r) for r in rest]), values**2))
     out: dict[int, Roughness] = {}
     for axis in range(3):
-        speed = np.concatenate([np.where(np.ptp(p.at.q_mm[:, axis]) > 0, np.abs(p.at.v_mm_s[:, axis]), np.inf) for p in paths])
-        gates = {v_c: look[:, axis] * np.exp(-2.0 * np.square(speed / v_c)) for v_c in GATES_MM_S}
+        gates = {v_c: tooth_variance(paths, axis, v_c) / noise for v_c in GATES_MM_S}
         gates = {v_c: g for v_c, g in gates.items() if _readings(g[read]) >= LEAST_READINGS}
         likely = sorted(gates, key=lambda v_c: -fits[1].score(gates[v_c][read]))[:REFINED]
         for v_c in likely:
             (rough, _, _), (raw, variance, u) = (f.gain(gates[v_c][read]) for f in fits)
             gain = min(rough / ALIKE, raw)
             if axis not in out or gain > out[axis].gain:
-                size = float(np.sqrt(3.0 * variance))
                 by_run = tuple(np.split(np.sqrt(gates[v_c]), np.cumsum([p.n for p in paths])[:-1]))
-                out[axis] = Roughness(gain, float(len(GATES_MM_S)), v_c, size, 1.5 * u / max(size, 1e-12), by_run)
+                out[axis] = Roughness(gain, float(len(GATES_MM_S)), v_c, *_height(variance, u), by_run)
+        if axis in out and out[axis].gain > WORTH:
+            out[axis] = _averaged(out[axis], fits[1], {v_c: g[read] for v_c, g in gates.items()})
     return out
+
+
+def _height(variance: float, u: float) -> tuple[float, float]:
+    """Return the half height of a saw-tooth and its standard uncertainty from its variance."""
+    size = float(np.sqrt(3.0 * variance))
+    return size, 1.5 * u / max(size, 1e-12)
+
+
+def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -> Roughness:
+    """Average height and speed over all gates, each with its likelihood, as an axis that creeps at one speed tells only their product."""
+    found = {v_c: fit.gain(g) for v_c, g in gates.items()}
+    gains = np.array([gain for gain, _, _ in found.values()])
+    weight = np.exp(gains - gains.max())
+    weight /= weight.sum()
+    size, own = np.array([_height(variance, u) for _, variance, u in found.values()]).T
+    mean = float(weight @ size)
+    u = float(np.sqrt(weight @ (own**2 + (size - mean) ** 2)))
+    return replace(rough, v_c=float(weight @ np.array([*found])), size_mm=mean, u_mm=u)
 
 
 def _readings(gate: F1) -> float:

@@ -9,10 +9,21 @@ import pytest
 import scipy
 
 from abbe.models.arrays import F1
+from abbe.models.discovery.baseline import baseline_of
+from abbe.models.discovery.discover import without
 from abbe.models.discovery.instrument_noise import Colour, comes_back, lone, remembered, unscaled
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, candidates, contaminated, extra_variance
+from abbe.models.discovery.localization import Localization
+from abbe.models.discovery.variance.scatter_effects import (
+    VarianceFinding,
+    candidates,
+    contaminated,
+    creeping,
+    extra_variance,
+    teeth_mm2,
+)
+from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.path import Path
-from tests.models.discovery.discovery_paths import bar, campaign, circle, noise
+from tests.models.discovery.discovery_paths import bar, campaign, case_of_paths, circle, noise
 
 PATHS = campaign()
 SIGMA = tuple(4e-4 if p.kind == "bar" else 3e-4 for p in PATHS)
@@ -90,6 +101,41 @@ def test_single_wrong_readings_of_a_bar_have_a_name_and_nothing_else_is_blamed()
     assert only.label == "bar_outliers"
     assert only.strength == pytest.approx(8.0, rel=0.1)
     assert only.parameters["rate"] == pytest.approx(0.05, abs=0.01)
+
+
+@pytest.mark.parametrize(("outliers", "names"), [(0.0, ["stick_slip"]), (0.05, ["bar_outliers", "stick_slip"])])
+def test_teeth_as_long_as_one_reading_are_no_outliers_of_the_bar(outliers: float, names: list[str]) -> None:
+    """Wrong readings are named where no axis sticks."""
+    rng = np.random.default_rng(2)
+    far = [(rng.uniform(size=p.n) < outliers) * (np.abs(p.at.v_mm_s[:, 0]) > 5.0) * float(p.kind == "bar") for p in PATHS]
+    gates = [(np.abs(p.at.v_mm_s[:, 0]) < 2.0) * float(np.ptp(p.at.q_mm[:, 0]) > 0 and p.kind == "bar") for p in PATHS]
+    teeth = [3e-3 * g * rng.uniform(-1.0, 1.0, g.size) * p.look[:, 0] for g, p in zip(gates, PATHS, strict=True)]
+    add = zip(noise(PATHS, 3), teeth, far, SIGMA, PATHS, strict=True)
+    rest = tuple(e + (a + 8e-3 * w * rng.choice([-1, 1], p.n)) / s for e, a, w, s, p in add)
+    alone = tuple(np.clip(w + (np.abs(a) > 2e-3), 0.0, 1.0) for a, w in zip(teeth, far, strict=True))
+    assert sum(a[g > 0].sum() for a, g in zip(alone, gates, strict=True)) > 20
+    assert sorted(f.name for f in extra_variance(PATHS, rest, SIGMA, alone=alone)) == names
+
+
+def test_an_axis_that_rests_does_not_stick() -> None:
+    stick = VarianceFinding("stick_slip", "Z", 3.0, 0.1, {"v_c": 2.0}, 50.0, Localization())
+    teeth, slow = teeth_mm2(PATHS, stick), creeping(PATHS, stick)
+    moves = np.concatenate([np.full(p.n, p.kind == "bar" and np.ptp(p.at.q_mm[:, 2]) > 0) for p in PATHS])
+    assert not teeth[~moves].any()
+    assert not slow[~moves].any()
+    assert slow[moves].any()
+    assert teeth.max() == pytest.approx(3e-3**2 / 3.0, rel=0.05)  # a tooth of half height h: h^2/3, where Z creeps along the bar
+
+
+def test_readings_that_an_axis_makes_scatter_have_less_weight_in_the_search() -> None:
+    case = case_of_paths(PATHS)
+    problem = whiten(case, baseline_of(case))
+    stick = VarianceFinding("stick_slip", "Z", 3.0, 0.1, {"v_c": 2.0}, 50.0, Localization())
+    teeth = teeth_mm2(problem.paths, stick)
+    use = without(problem, [stick]).use
+    assert np.allclose(np.square(problem.sd_mm() / use), np.square(problem.sd_mm()) + teeth, rtol=1e-9)
+    assert use.max() == 1.0
+    assert use.min() < 0.3
 
 
 def test_readings_off_in_a_row_or_at_every_reversal_are_no_accident() -> None:
