@@ -1,4 +1,4 @@
-"""The gap, measured minus simulated: of every run, along one run, and over the volume; before and after effects are added to the model."""
+"""Pictures of the gap, measured minus simulated: per run, along one run, and over the volume, before and after effects are added."""
 
 from __future__ import annotations
 
