@@ -29,7 +29,7 @@ help: ## list what can be made
 demo: $(RUN_READY) ## measure, correct and verify a simulated machine; writes a report
 	@$(BIN)/abbe demo $(ARGS)
 
-test: $(DEV_READY) ## all tests, side by side, about 10 minutes on two cores; ARGS=FILE: only these, one after the other
+test: $(DEV_READY) ## all tests, side by side, 7 to 15 minutes on two cores; ARGS=FILE: only these, one after the other
 	@env -u PYTHONDONTWRITEBYTECODE OPENBLAS_NUM_THREADS=1 $(BIN)/python -m pytest $(or $(ARGS),-p tests.progress -n $(WORKERS) --dist loadfile --no-loadscope-reorder --timeout 400)
 
 test-long: $(DEV_READY) ## hours: what is too long for every run, at full size; Ctrl-C stops it, and it goes on where it was

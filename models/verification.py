@@ -1,4 +1,5 @@
-"""Figures of a verification run, each with its standard uncertainty: body-diagonal range, helix rms, rms of an artefact in a pose."""
+"""Figures of a verification run, each with its standard uncertainty: range and reversal of a body diagonal, helix rms, rms of an artefact
+in a pose."""
 
 from __future__ import annotations
 
@@ -38,8 +39,33 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
 
     Half of (out - back) is lost motion; its scatter gives the noise. The wavelength adds an uncertainty proportional to the
     length. Readings are paired by their position on the line, so a missing reading removes only its own pair. ``turning_mm``: where the
-    machine turned beyond the ends, (3,) each; these are not positions of the test.
+    machine turned beyond the ends, (3,) each; these are no positions of the test.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 3 positions were measured out and back.
     """
+    position, out, back = _out_and_back(run, turning_mm)
+    mean, length = (out + back) / 2, position[-1] - position[0]
+    scatter = float(np.std((out - back) / 2, ddof=1))  # a mean of two readings has the same scatter
+    return VerificationFigure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), position, mean)
+
+
+def reversal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> VerificationFigure:
+    """Return the size of the mean reversal value along a body diagonal, with its uncertainty (ISO 230-2, mean reversal value).
+
+    The curve is out minus back. Its scatter over the positions gives the uncertainty; a reversal that varies along the diagonal
+    enlarges it. Parameters and errors as for `diagonal_figure`.
+    """
+    position, out, back = _out_and_back(run, turning_mm)
+    reversal = out - back
+    u = float(np.std(reversal, ddof=1)) / np.sqrt(len(reversal))
+    return VerificationFigure(float(abs(np.mean(reversal))), float(u), position, reversal)
+
+
+def _out_and_back(run: RunData, turning_mm: Sequence[F1]) -> tuple[F1, F1, F1]:
+    """Return the positions along a diagonal, and the deviations there on the way out and back, mm."""
     assert run.beam is not None
     s = np.round((run.axes_mm - run.axes_mm[0]) @ run.beam, 4)
     turns = [float((point - run.axes_mm[0]) @ run.beam) for point in turning_mm]
@@ -50,11 +76,7 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
     both = [float(p) for p in places if float(p) in out and float(p) in back]
     if len(both) < 3:
         raise ValueError(f"run {run.label}: fewer than 3 positions were measured out and back")
-    mean = np.array([(out[p] + back[p]) / 2 for p in both])
-    half = np.array([(out[p] - back[p]) / 2 for p in both])
-    scatter = float(np.std(half, ddof=1))  # a mean of two readings has the same scatter
-    length = both[-1] - both[0]
-    return VerificationFigure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), np.array(both), mean)
+    return np.array(both), np.array([out[p] for p in both]), np.array([back[p] for p in both])
 
 
 def helix_figure(run: RunData) -> VerificationFigure:

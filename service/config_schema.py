@@ -317,6 +317,14 @@ class Verify(ConfigTable):
 
     body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
     helix_rms_um: Positive = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
+    reversal_um: Positive | None = Field(
+        default=None, description="largest mean reversal value of a body diagonal; absent: it is measured, but not judged"
+    )
+
+    def limits_um(self) -> dict[str, float]:
+        """Return the limits by the names of the figures, without those that are not judged."""
+        limits = {"body_diagonal_um": self.body_diagonal_um, "helix_rms_um": self.helix_rms_um, "reversal_um": self.reversal_um}
+        return {key: limit for key, limit in limits.items() if limit is not None}
 
 
 def _broker(text: str | None) -> str | None:

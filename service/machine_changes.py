@@ -31,7 +31,7 @@ RIGHTS: Mapping[str, Permission] = MappingProxyType(
     }
 )
 """Sections that can be changed, with the right for it. Addresses, geometry, store, page, keys and users' rights cannot."""
-Looser = Literal["more", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
+Looser = Literal["more", "higher", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
 LOOSER: Mapping[str, Looser] = MappingProxyType(
     {
         **dict.fromkeys(
@@ -49,6 +49,7 @@ LOOSER: Mapping[str, Looser] = MappingProxyType(
             ),
             "more",
         ),
+        "verify.reversal_um": "higher",
         "limits.two_people": "less",
         "limits.settle_s": "less",
         "limits.temperature_c": "wider",
@@ -71,14 +72,15 @@ LOOSER: Mapping[str, Looser] = MappingProxyType(
         "schedule.name": "stated",
     }
 )
-"""Changes of a value that allow more than before. ``more``, ``less``: a larger, a smaller value; ``wider``: a range that is not inside the
-old one, or no range any more; ``added``: further entries; ``later``: a later day, or the first; ``stated``: any stated value; ``changed``:
-another value; ``raised``: another value, except those of `UNRAISED`; ``dropped``: another value, unless the old one was ``any``. Of a new
-schedule only the name is judged, of a removed schedule nothing."""
+"""Changes of a value that allow more than before. ``more``, ``less``: a larger, a smaller value; ``higher``: a larger value, or none any
+more; ``wider``: a range that is not inside the old one, or no range any more; ``added``: further entries; ``later``: a later day, or the
+first; ``stated``: any stated value; ``changed``: another value; ``raised``: another value, except those of `UNRAISED`; ``dropped``: another
+value, unless the old one was ``any``. Of a new schedule only the name is judged, of a removed schedule nothing."""
 UNRAISED = ("skip", "none")
 _IS_LOOSER: Mapping[Looser, Callable[[Any, Any], bool]] = MappingProxyType(
     {
         "more": lambda old, new: new > old,
+        "higher": lambda old, new: old is not None and (new is None or new > old),
         "less": lambda old, new: new < old,
         "added": lambda old, new: not set(new) <= set(old),
         "wider": lambda old, new: old is not None and (new is None or new[0] < old[0] or new[1] > old[1]),

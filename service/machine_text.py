@@ -51,6 +51,7 @@ VERIFY = """
 [verify]
 body_diagonal_um = 20.0
 helix_rms_um = 5.0
+# reversal_um = 5.0
 """
 CERTIFIED = ("ballbar", "laser", "artefact")
 LIMITS = """

@@ -109,10 +109,9 @@ def rules_of(config: MachineFile | None) -> Rules:
     """Limits of the check, certificates, allowed temperature and expansion from a machine file; empty without a file."""
     if config is None:
         return Rules()
-    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
     materials = config.material.by_axis()
     return Rules(
-        limits,
+        config.verify.limits_um(),
         config.calibration.until(),
         config.limits.temperature_c,
         materials,

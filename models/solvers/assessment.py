@@ -183,7 +183,7 @@ MAP_NODES = 5
 
 @dataclass(frozen=True)
 class MapAgainstPrior:
-    """Rms over the volume, mm, of a solution's map, of its standard uncertainty, and of the errors that the priors expect."""
+    """Rms lengths over the volume, mm: of a solution's map, of its standard uncertainty, and of a usual machine's errors by the priors."""
 
     predicted_mm: float
     u_mm: float

@@ -144,7 +144,7 @@ def total(parts: tuple[InformationSums, ...]) -> InformationSums:
 
 @dataclass(frozen=True)
 class Components:
-    """Log ratios of estimated to expected variances. ``psi``: error sizes (`SizeModel`); ``eta``: noise of each instrument."""
+    """Log ratios of estimated to expected variances: of error sizes (``psi`` of `SizeModel`), and of noise (``eta``, per instrument)."""
 
     psi: F1
     eta: F1

@@ -100,6 +100,8 @@ def _title(name: str) -> str:
         return "Helix, rms (other centre and radius)"
     if name == "body_diagonal_um":
         return "Largest body diagonal"
+    if name == "reversal_um":
+        return "Largest mean reversal of a body diagonal"
     return f"Body diagonal {name.removeprefix('diagonal_').removesuffix('_um')}"
 
 

@@ -29,7 +29,7 @@ HEADINGS = "columns are: phase (deg) and radius; or position (mm) and deviation 
 
 
 def cyclic_error_of(path: Path, fringe_nm: float) -> CyclicError:
-    """Find the cyclic error, mm, in a table of signals in quadrature, of phase and radius, or of readings along a slow run.
+    """Read a table and find the cyclic error, mm: of signals in quadrature (or as phase and radius), or of readings along a slow run.
 
     ``fringe_nm``: displacement per period of the signals.
 

@@ -15,11 +15,8 @@ from abbe.service.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """PEM files of an encrypted connection.
-
-    ``ca``: authority that signed the broker's certificate; empty: the authorities that this computer trusts. ``certificate``, ``key``: of
-    the client, if the broker requires them.
-    """
+    """PEM files of an encrypted connection: of the authority that signed the broker's certificate (empty: those that this computer trusts),
+    and the client's certificate with its key, if the broker requires one."""
 
     ca: str = ""
     certificate: str = ""

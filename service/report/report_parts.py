@@ -147,6 +147,8 @@ def figure_names(key: str) -> tuple[str, str, str]:
         return "helix rms", "ball-bar on the check helix, rms about its own centre", VERIFICATION
     if key == "body_diagonal_um":
         return "diagonal, worst", "largest range of the bidirectional means of a body diagonal", VERIFICATION
+    if key == "reversal_um":
+        return "reversal, worst", "largest mean reversal value of a body diagonal", VERIFICATION
     name = key.removeprefix("diagonal_").removesuffix("_um")
     return f"diagonal {name}", f"range of the bidirectional means of body diagonal {name}", VERIFICATION
 

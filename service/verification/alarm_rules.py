@@ -16,9 +16,7 @@ from abbe.service.tables.push_journal import JournalView
 from abbe.service.verification.alarm_states import Alarm, FiredRule, after_check
 from abbe.service.verification.alarms import active_alarm
 from abbe.service.verification.trend_table import COVERAGE, FigureTrend, of_series, trends
-from abbe.service.verification.verify import judge
-
-NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}
+from abbe.service.verification.verify import NAMES, judge
 
 
 @dataclass(frozen=True, slots=True)

@@ -184,7 +184,7 @@ def reduction_of(runs: Sequence[Run], axis: str, materials: Mapping[str, AxisMat
 
 
 def diagonal_reduction_of(runs: Sequence[Run], materials: Mapping[str, AxisMaterial]) -> Reduction:
-    """Return the reduction of a test along a diagonal. It combines those of its axes; if an axis has none, neither has the test."""
+    """Decide whether and how the test along a diagonal in these runs is reduced: as its axes are, or not at all."""
     way = runs[0].laser.span_mm
     shares = {axis: float(share) for axis, share in zip(AXES, way**2 / (way @ way), strict=True) if share > 0.0}
     each = {axis: reduction_of(runs, axis, materials) for axis in shares}

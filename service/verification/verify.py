@@ -5,14 +5,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
 from abbe.drivers.errors import DriverError
-from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure, same_pose
+from abbe.models.verification import VerificationFigure, diagonal_figure, helix_figure, pose_figure, reversal_figure, same_pose
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.run import ArtefactSetup, Run
 from abbe.service.domain.schedule import Schedule
@@ -34,6 +34,8 @@ the size of a correction. An assumption of this service: without sensors in the 
 
 DIAGONALS = frozenset({"ppp", "npp", "pnp", "ppn"})
 
+NAMES = {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms", "reversal_um": "worst mean reversal"}
+"""Figures of a check that texts name, by their key."""
 MARK = {"pass": "within limits", "fail": "out of limits", "cannot tell": "too close to a limit to tell"}
 SCHEMA = 1
 """Version of the documents of checks. It rises when a key changes its meaning or disappears, not for new keys."""
@@ -42,6 +44,7 @@ SCHEMA = 1
 @dataclass(frozen=True)
 class VerificationFigures:
     """Figures of one verification: body diagonals by name, and the helix. ``of``: ``diagonals`` may instead hold an artefact's poses.
+    ``reversals``: mean reversal values of the body diagonals, by their names.
 
     ``air_c``: lowest and highest air temperature, None without any reading. ``tables``: CRC of every table that was active during its runs;
     None stands for a run that does not record it.
@@ -52,17 +55,23 @@ class VerificationFigures:
     air_c: tuple[float, float] | None = None
     tables: frozenset[int | None] = frozenset()
     of: Literal["body diagonal", "pose"] = "body diagonal"
+    reversals: Mapping[str, VerificationFigure] = field(default_factory=dict)
 
     @property
     def finite(self) -> bool:
         """Whether every figure and every uncertainty is a number."""
-        every = [*self.diagonals.values(), *([self.helix] if self.helix is not None else [])]
+        every = [*self.diagonals.values(), *self.reversals.values(), *([self.helix] if self.helix is not None else [])]
         return all(np.isfinite(f.value_mm) and np.isfinite(f.u_mm) for f in every)
 
     @property
     def worst(self) -> VerificationFigure:
         """The body diagonal with the largest range, or the worst pose."""
         return max(self.diagonals.values(), key=lambda f: f.value_mm)
+
+    @property
+    def reversal(self) -> VerificationFigure | None:
+        """The largest mean reversal value of a body diagonal; None for poses of an artefact."""
+        return max(self.reversals.values(), key=lambda f: f.value_mm, default=None)
 
 
 def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> VerificationFigures:
@@ -75,12 +84,14 @@ def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> Verif
     MeasurementFault
         A body diagonal is missing, or a run is not judged (`abbe.service.runs.coverage`) or has too few valid readings.
     """
-    diagonals, helix = {}, None
+    diagonals, reversals, helix = {}, {}, None
     for run in runs:
         if run.test == "laser_diagonal" and not run.laser.order and not run.laser.face:
             check_judged(run)
+            data, turning_mm = run_data(run), run.laser.ends_mm if run.laser.overrun_mm else ()
             try:
-                diagonals[run.laser.diagonal] = diagonal_figure(run_data(run), run.laser.ends_mm if run.laser.overrun_mm else ())
+                diagonals[run.laser.diagonal] = diagonal_figure(data, turning_mm)
+                reversals[run.laser.diagonal] = reversal_figure(data, turning_mm)
             except ValueError as error:
                 raise MeasurementFault(str(error), "measure it again") from None
         elif run.test == "ballbar_helix":
@@ -91,7 +102,8 @@ def figures(runs: list[Run], room_c: tuple[float, float] | None = None) -> Verif
         raise MeasurementFault(
             f"these runs are not a verification: body diagonal {lost} is missing", "measure the verification campaign again"
         )
-    return VerificationFigures(diagonals, helix, _air_c(runs) or room_c, frozenset(run.table.crc for run in runs))
+    air_c, tables = _air_c(runs) or room_c, frozenset(run.table.crc for run in runs)
+    return VerificationFigures(diagonals, helix, air_c, tables, reversals=reversals)
 
 
 def pose_figures(runs: list[Run], known: JointSolution, room_c: tuple[float, float] | None = None) -> VerificationFigures:
@@ -198,6 +210,8 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
     pairs = [(f"{kind} {k}", before.diagonals[k], after.diagonals[k], worst) for k in sorted(before.diagonals)]
     if before.helix is not None and after.helix is not None:
         pairs.append(("helix", before.helix, after.helix, before.helix.value_mm))
+    if before.reversal is not None and after.reversal is not None:
+        pairs.append(("mean reversal", before.reversal, after.reversal, worst))
     for name, old, new, scale in pairs:
         if _expanded(old, new) > gain:
             blind = f"the {name} is uncertain by {_expanded(old, new) * 1e3:.1f} µm, more than the {gain * 1e3:.1f} µm that were gained"
@@ -232,6 +246,8 @@ def figure_rows(found: VerificationFigures) -> dict[str, tuple[float, float]]:
     rows["body_diagonal_um" if found.of == "body diagonal" else "worst_pose_um"] = (found.worst.value_mm * 1e3, found.worst.u_mm * 1e3)
     if found.helix is not None:
         rows["helix_rms_um"] = (found.helix.value_mm * 1e3, found.helix.u_mm * 1e3)
+    if found.reversal is not None:
+        rows["reversal_um"] = (found.reversal.value_mm * 1e3, found.reversal.u_mm * 1e3)
     return rows
 
 
@@ -244,9 +260,10 @@ def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetim
         The runs are not a complete check: a body diagonal is missing, or a run was not measured to its end.
     """
     rows = figure_rows(figures(runs))
-    limits = {"body_diagonal_um": config.verify.body_diagonal_um, "helix_rms_um": config.verify.helix_rms_um}
+    limits = config.verify.limits_um()
     verdict = overall([judge(*rows[k], limits[k]) for k in limits if k in rows])
-    text = f"{MARK[verdict]}: " + ", ".join(f"{_name(k)} {rows[k][0]:.1f} µm (limit {limits[k]:g})" for k in limits if k in rows)
+    shown = [f"{name} {rows[k][0]:.1f} µm" + (f" (limit {limits[k]:g})" if k in limits else "") for k, name in NAMES.items() if k in rows]
+    text = f"{MARK[verdict]}: {', '.join(shown)}"
     against = [*_air(runs, config.limits.temperature_c), *_ended(config, rows, started)]
     if against:
         verdict = "cannot tell"
@@ -263,10 +280,6 @@ def judged(config: MachineFile, runs: list[Run], campaign: str, started: datetim
         text,
         not against,
     )
-
-
-def _name(key: str) -> str:
-    return {"body_diagonal_um": "worst body diagonal", "helix_rms_um": "helix rms"}[key]
 
 
 def _ended(config: MachineFile, names: Iterable[str], started: datetime) -> list[str]:

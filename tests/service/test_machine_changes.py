@@ -126,6 +126,8 @@ def test_a_new_schedule_is_looser_by_its_name_and_a_removed_one_in_nothing(loade
         ("limits.table_value_um", 80.0, 81.0),
         ("limits.two_people", True, False),
         ("limits.settle_s", 10.0, 9.0),
+        ("verify.reversal_um", 5.0, 6.0),
+        ("verify.reversal_um", 5.0, None),
         ("limits.temperature_c", [19.0, 21.0], [19.0, 21.5]),
         ("limits.temperature_c", [19.0, 21.0], [18.0, 20.0]),
         ("limits.run_temperature_c", [19.0, 21.0], None),

@@ -1,4 +1,4 @@
-"""Pictures of the gap, measured minus simulated: per run, along one run, and over the volume, before and after effects are added."""
+"""The gap, measured minus simulated: of every run, along one run, and over the volume; before and after effects are added to the model."""
 
 from __future__ import annotations
 

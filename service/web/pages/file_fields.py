@@ -47,7 +47,7 @@ ISSUER = (
     Field("issuer.place", "choice", PLACES),
 )
 ITEM = _fields("item", maker="text", model="text", serial="text", place="text")
-VERIFY = _fields("verify", body_diagonal_um="number", helix_rms_um="number")
+VERIFY = _fields("verify", body_diagonal_um="number", helix_rms_um="number", reversal_um="maybe")
 PUSH = _fields(
     "limits",
     table_value_um="number",

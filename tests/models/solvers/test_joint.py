@@ -4,6 +4,7 @@ Two machines; three with ``ABBE_TEST_LONG=1``.
 """
 
 import os
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -17,7 +18,7 @@ from abbe.models.solvers.joint import JointSolution, solve_joint
 from abbe.models.solvers.observations import block_average, nominal_reading
 from abbe.models.uncertainty.inputs import StatedInputs
 from abbe.models.uncertainty.sources import error_sources
-from abbe.models.verification import diagonal_figure, helix_figure
+from abbe.models.verification import diagonal_figure, helix_figure, reversal_figure
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 
@@ -99,3 +100,16 @@ def test_figures_of_a_verification_do_not_feel_the_mounting():
     near, far = truth.bar("a", np.array([270.0, 275.0, 54.0]), 154.0), truth.bar("b", np.array([270.0, 275.0, 54.0]), 154.0, 5e-3)
     a, b = helix_figure(block_average(near, 300)), helix_figure(block_average(far, 300))
     assert a.value_mm == pytest.approx(b.value_mm, abs=2 * a.u_mm)
+
+
+def test_reversal_is_a_figure_of_its_own_beside_the_range_of_the_means():
+    start, end = diagonal_ends(MACHINE.stroke_mm + np.array([10.0, -10.0]), "pnp")
+    run = Truth(4).laser("v", straight_line(start, end, 21))
+    assert run.beam is not None
+    back = np.arange(len(run.deviation_mm)) > np.argmax(run.axes_mm @ run.beam)
+    worn = replace(run, deviation_mm=run.deviation_mm - np.where(back, 8e-3, 0.0))
+    before, after = reversal_figure(run), reversal_figure(worn)
+    assert np.mean(after.deviation_mm) - np.mean(before.deviation_mm) == pytest.approx(8e-3)
+    assert after.value_mm == pytest.approx(abs(np.mean(after.deviation_mm)))
+    assert after.u_mm == pytest.approx(before.u_mm)
+    assert diagonal_figure(worn).value_mm == pytest.approx(diagonal_figure(run).value_mm)

@@ -1,11 +1,18 @@
 """Keep or go back, pass or fail: decisions about measured figures with their uncertainty."""
 
+from datetime import UTC, datetime
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from abbe.models.verification import VerificationFigure
+from abbe.service.config import load_machine
 from abbe.service.errors import TableRefused
-from abbe.service.verification.verify import VerificationFigures, check_before, decide, judge, overall
+from abbe.service.verification.verify import VerificationFigures, check_before, decide, judge, judged, overall
+from tests.run_documents import runs_of
+from tests.service.backup.conftest import new_machine_file
+from tests.service.verification.test_coverage import verification
 
 NONE = np.zeros(0)
 
@@ -14,13 +21,21 @@ AIR = (20.0, 20.4)
 
 
 def figures(
-    ppp: float, others: float = 5.0, helix: float | None = 5.0, u: float = 0.5, u_helix: float = 0.5, air=AIR, crc=(7,)
+    ppp: float,
+    others: float = 5.0,
+    helix: float | None = 5.0,
+    u: float = 0.5,
+    u_helix: float = 0.5,
+    air=AIR,
+    crc=(7,),
+    reversal: float | None = None,
 ) -> VerificationFigures:
     def figure(um: float, u: float = u) -> VerificationFigure:
         return VerificationFigure(um * 1e-3, u * 1e-3, NONE, NONE)
 
     diagonals = {"ppp": figure(ppp)} | {k: figure(others) for k in ("npp", "pnp", "ppn")}
-    return VerificationFigures(diagonals, None if helix is None else figure(helix, u_helix), air, frozenset(crc))
+    reversals = {} if reversal is None else {"ppp": figure(reversal), "npp": figure(0.0)}
+    return VerificationFigures(diagonals, None if helix is None else figure(helix, u_helix), air, frozenset(crc), reversals=reversals)
 
 
 @pytest.mark.parametrize(
@@ -33,6 +48,9 @@ def figures(
         (figures(60, others=4), figures(10, others=9), True, "60.0 → 10.0"),  # 5 um is a small part of what the worst one was
         (figures(40), figures(10, helix=7.5), False, "helix got worse"),
         (figures(40, helix=2.0), figures(10, helix=6.9), False, "helix got worse"),
+        (figures(40, reversal=2.0), figures(10, reversal=3.0), True, "40.0 → 10.0"),
+        (figures(40, reversal=2.0), figures(10, reversal=8.0), False, "mean reversal got worse"),
+        (figures(40, reversal=2.0), figures(10, reversal=float("nan")), False, "not a number"),
         (figures(40), figures(10, helix=None), False, "only one of the two verifications has a helix"),
         (figures(40, helix=None), figures(10), False, "only one of the two verifications has a helix"),
         (figures(40, helix=None), figures(10, helix=None), True, "40.0 → 10.0"),
@@ -74,3 +92,19 @@ def test_a_verification_that_nothing_compares_with_is_refused_before_anything_is
     with pytest.raises(TableRefused, match=why):
         check_before(before)
     check_before(figures(40))
+
+
+def test_a_check_measures_the_reversal_and_judges_it_only_with_a_limit(tmp_path: Path) -> None:
+    config = load_machine(new_machine_file(tmp_path)).machine
+    limited = config.model_copy(update={"verify": config.verify.model_copy(update={"reversal_um": 4.0})})
+    runs = verification()
+    for run in runs[:4]:  # eight micrometres are lost on the way back; the means, and so the diagonals, stay as they are
+        there = run["columns"]
+        there["deviation_mm"] = [v - (0.008 if way < 0 else 0.0) for v, way in zip(there["deviation_mm"], there["direction"], strict=True)]
+    when = datetime(2026, 11, 29, tzinfo=UTC)
+    open_, strict = (judged(one, runs_of(runs), "june", when, 60.0) for one in (config, limited))
+    assert open_.values["reversal_um"] == pytest.approx(8.0, abs=2 * open_.uncertainties["reversal_um"])
+    assert "reversal_um" not in open_.limits
+    assert open_.text.endswith("worst mean reversal 8.0 µm")
+    assert strict.verdict == "fail"
+    assert strict.text.endswith("worst mean reversal 8.0 µm (limit 4)")
