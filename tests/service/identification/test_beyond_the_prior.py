@@ -34,9 +34,10 @@ def test_a_rough_machine_gets_a_map_that_stays_in_the_size_of_machines(shared: P
 
 
 def test_a_map_larger_or_less_known_than_the_prior_allows_is_not_carried_by_its_readings() -> None:
-    assert MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05).carried
-    assert not MapAgainstPrior(predicted_mm=0.16, u_mm=0.01, prior_mm=0.05).carried
-    assert not MapAgainstPrior(predicted_mm=0.01, u_mm=0.06, prior_mm=0.05).carried
+    assert MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05, measured_mm=0.06).carried
+    assert not MapAgainstPrior(predicted_mm=0.16, u_mm=0.01, prior_mm=0.05, measured_mm=0.06).carried
+    assert not MapAgainstPrior(predicted_mm=0.01, u_mm=0.06, prior_mm=0.05, measured_mm=0.06).carried
+    assert not MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05, measured_mm=0.02).carried
 
 
 def test_a_smooth_machine_keeps_its_map(shared: Path, tmp_path: Path) -> None:
