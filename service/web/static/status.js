@@ -86,6 +86,7 @@ let asking = new AbortController();
 let quietUntil = 0;
 
 function ask(path, active) {
+  if (performance.now() < quietUntil) return Promise.reject(new Error("logged out"));
   const one = asking = new AbortController();
   setTimeout(() => one.abort(), PATIENCE_MS);
   return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: one.signal });

@@ -120,7 +120,7 @@ def test_a_stick_slip_where_the_strong_effect_of_another_axis_leaves_no_scatter_
 def test_scatter_at_the_reversals_of_the_strong_effect_itself_may_be_its_residue() -> None:
     found = discover(sticking(0, backlash_um=30.0), TURNS)
     assert [e.label for e in found.effects] == ["backlash:X"]
-    assert "possibly only the deviation of backlash:X" in dict(found.rejected)["stick_slip:X"]
+    assert "may be only the deviation of backlash:X" in dict(found.rejected)["stick_slip:X"]
 
 
 def test_a_strong_effect_as_rough_as_the_scatter_may_leave_it() -> None:
