@@ -20,7 +20,8 @@ COMPILE := uv pip compile -q --universal --python-version 3.11 --generate-hashes
 .PHONY: help demo test test-long lint fmt docs site pictures bench lock release clean
 # Most of a test's time is waiting for ports and processes, so there are more workers than cores; each may take a gigabyte.
 CORES := $(shell getconf _NPROCESSORS_ONLN 2>/dev/null || echo 2)
-WORKERS ?= $(shell n=$$(( $(CORES) * 3 )); echo $$(( n < 8 ? n : 8 )))
+GIGABYTES := $(shell awk '/MemAvailable/ {print int($$2 / 1000000)}' /proc/meminfo 2>/dev/null || echo 8)
+WORKERS ?= $(shell n=$$(( $(CORES) * 2 )); m=$(or $(GIGABYTES),8); n=$$(( n < 8 ? n : 8 )); n=$$(( n < m ? n : m )); echo $$(( n > 1 ? n : 1 )))
 
 help: ## list what can be made
 	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "  make %-9s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)

@@ -46,7 +46,7 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
     ValueError
         Fewer than 3 positions were measured out and back.
     """
-    position, out, back = _out_and_back(run, turning_mm)
+    position, out, back, _ = _out_and_back(run, turning_mm)
     mean, length = (out + back) / 2, position[-1] - position[0]
     scatter = float(np.std((out - back) / 2, ddof=1))  # a mean of two readings has the same scatter
     return VerificationFigure(float(np.ptp(mean)), float(np.hypot(np.sqrt(2.0) * scatter, U_WAVELENGTH * length)), position, mean)
@@ -55,17 +55,21 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
 def reversal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> VerificationFigure:
     """Return the size of the mean reversal value along a body diagonal, with its uncertainty (ISO 230-2, mean reversal value).
 
-    The curve is out minus back. Its scatter over the positions gives the uncertainty; a reversal that varies along the diagonal
-    enlarges it. Parameters and errors as for `diagonal_figure`.
+    The curve is out minus back. Its scatter over the positions gives the uncertainty, with what a drift during the run adds to the mean:
+    the part of the curve that grows with the time between both readings. A reversal that varies along the diagonal enlarges both. Without
+    ``turning_mm`` the two ends, where the machine does not move between both readings, are left out if three other positions remain.
+    Parameters and errors as for `diagonal_figure`.
     """
-    position, out, back = _out_and_back(run, turning_mm)
-    reversal = out - back
-    u = float(np.std(reversal, ddof=1)) / np.sqrt(len(reversal))
-    return VerificationFigure(float(abs(np.mean(reversal))), float(u), position, reversal)
+    position, out, back, waited_s = _out_and_back(run, turning_mm)
+    inner = slice(1, -1) if not turning_mm and len(position) >= 5 else slice(None)
+    reversal, late_s = (out - back)[inner], waited_s[inner] - waited_s[inner].mean()
+    drift = float(late_s @ reversal / max(late_s @ late_s, 1e-12)) * float(waited_s[inner].mean())
+    u = np.hypot(float(np.std(reversal, ddof=1)) / np.sqrt(len(reversal)), drift / np.sqrt(3.0))
+    return VerificationFigure(float(abs(np.mean(reversal))), float(u), position[inner], reversal)
 
 
-def _out_and_back(run: RunData, turning_mm: Sequence[F1]) -> tuple[F1, F1, F1]:
-    """Return the positions along a diagonal, and the deviations there on the way out and back, mm."""
+def _out_and_back(run: RunData, turning_mm: Sequence[F1]) -> tuple[F1, F1, F1, F1]:
+    """Return the positions along a diagonal, the deviations there on the way out and back, mm, and the time between both, s."""
     assert run.beam is not None
     s = np.round((run.axes_mm - run.axes_mm[0]) @ run.beam, 4)
     turns = [float((point - run.axes_mm[0]) @ run.beam) for point in turning_mm]
@@ -76,7 +80,9 @@ def _out_and_back(run: RunData, turning_mm: Sequence[F1]) -> tuple[F1, F1, F1]:
     both = [float(p) for p in places if float(p) in out and float(p) in back]
     if len(both) < 3:
         raise ValueError(f"run {run.label}: fewer than 3 positions were measured out and back")
-    return np.array(both), np.array([out[p] for p in both]), np.array([back[p] for p in both])
+    first, second = (dict(zip(s[part].tolist(), run.t_s[part].tolist(), strict=True)) for part in (slice(turn + 1), slice(turn + 1, None)))
+    waited_s = np.array([second[p] - first[p] for p in both])
+    return np.array(both), np.array([out[p] for p in both]), np.array([back[p] for p in both]), waited_s
 
 
 def helix_figure(run: RunData) -> VerificationFigure:

@@ -449,7 +449,7 @@ class Conversation:
 
     async def _waited(self, future: asyncio.Future[Answer]) -> Answer:
         loop = asyncio.get_running_loop()
-        last_s = loop.time() + _DRAIN_S
+        last_s, waited_longer = loop.time() + _DRAIN_S, False
         while True:
             due_s = loop.time() + self._answer_s()
             try:
@@ -459,5 +459,6 @@ class Conversation:
                 if isinstance(error, DriverError) or loop.time() > last_s:
                     raise
                 stalled = loop.time() - due_s > _STALL_S  # the reply may lie in a buffer: the threads that read it had no core, either
-                if not (stalled or future.done() or self._backlog()):
+                if not (future.done() or self._backlog() or (stalled and not waited_longer)):
                     raise
+                waited_longer |= stalled

@@ -181,6 +181,8 @@ LARGEST_MAP = 3.0
 MOST_READ = 2.0
 """Largest excess of the rms of a map over that of a usual machine, as a multiple of the largest rms of a run. Of 500 campaigns of one to
 five runs one exceeded it: a step diagonal alone on a rough machine, whose map was 6 times as large as the machine's errors."""
+WELL_KNOWN = 0.2
+"""Relative uncertainty below which a map may be larger than what was measured: a small circle shows the squareness of a large machine."""
 MAP_NODES = 5
 
 
@@ -199,10 +201,14 @@ class MapAgainstPrior:
     @property
     def carried(self) -> bool:
         """Whether readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times this rms, and
-        its rms exceeds that of the priors by at most `MOST_READ` times what a run measured.
+        the runs measured enough for it (`read`).
         """
-        most_mm = min(LARGEST_MAP * self.prior_mm, self.prior_mm + MOST_READ * self.measured_mm)
-        return self.u_mm <= self.prior_mm and self.predicted_mm <= most_mm
+        return self.u_mm <= self.prior_mm and self.predicted_mm <= LARGEST_MAP * self.prior_mm and self.read
+
+    @property
+    def read(self) -> bool:
+        """Whether the map exceeds the priors' rms by at most `MOST_READ` times what a run measured, or is known to `WELL_KNOWN`."""
+        return self.predicted_mm <= self.prior_mm + MOST_READ * self.measured_mm or self.u_mm <= WELL_KNOWN * self.predicted_mm
 
 
 def map_against_prior(solution: JointSolution) -> MapAgainstPrior:

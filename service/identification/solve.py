@@ -236,10 +236,10 @@ def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssu
     if found is None or found.carried:
         return None
     worst = max(joint.runs, key=lambda run: run.rms_mm / run.expected_mm)
+    why = "smooth motions do not fit these readings" if found.read else f"no run measured more than {found.measured_mm * 1e3:.0f} µm rms"
     what = (
         f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, for a usual "
-        f"machine {found.prior_mm * 1e3:.0f} µm, and no run measured more than {found.measured_mm * 1e3:.0f} µm rms: the readings do not "
-        f"support such a map{instead}"
+        f"machine {found.prior_mm * 1e3:.0f} µm: {why}{instead}"
     )
     return CampaignIssue(worst.label, what, "look for the pitch of a screw or a kink of a rail: measure the axes in fine steps", False)
 

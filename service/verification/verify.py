@@ -26,7 +26,8 @@ if TYPE_CHECKING:
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""Share by which a figure may get worse beyond its U: for a diagonal, of the worst diagonal before; for a helix, of its own value."""
+"""Share by which a figure may get worse beyond its U: for a diagonal and its reversal, of the worst diagonal before; for a helix, of its
+own value."""
 
 SAME_AIR_C = 1.0
 """Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is
@@ -210,8 +211,8 @@ def decide(before: VerificationFigures, after: VerificationFigures, pushed_crc: 
     pairs = [(f"{kind} {k}", before.diagonals[k], after.diagonals[k], worst) for k in sorted(before.diagonals)]
     if before.helix is not None and after.helix is not None:
         pairs.append(("helix", before.helix, after.helix, before.helix.value_mm))
-    if before.reversal is not None and after.reversal is not None:
-        pairs.append(("mean reversal", before.reversal, after.reversal, worst))
+    both = sorted(before.reversals.keys() & after.reversals.keys())
+    pairs += [(f"mean reversal of {k}", before.reversals[k], after.reversals[k], worst) for k in both]
     for name, old, new, scale in pairs:
         if _expanded(old, new) > gain:
             blind = f"the {name} is uncertain by {_expanded(old, new) * 1e3:.1f} µm, more than the {gain * 1e3:.1f} µm that were gained"

@@ -13,7 +13,6 @@ import time
 from contextlib import suppress
 from pathlib import Path
 
-from tests import hardware
 from tests.patience import within
 
 Point = tuple[float, float, float]
@@ -67,8 +66,8 @@ class Instance:
         drives.write_text(text.removesuffix(SAMPLER) + SAMPLER)
         fd = self.listening.fileno()
         self._process = await asyncio.create_subprocess_exec(
-            # whatever becomes of us, it does not outlive us; and it is hardware, which does not wait for a core
-            *("nice", "-n", str(hardware.AHEAD), "setpriv", "--pdeathsig", "KILL", str(DEPLOY / "isolated.sh"), str(self.run)),
+            # whatever becomes of us, it does not outlive us
+            *("setpriv", "--pdeathsig", "KILL", str(DEPLOY / "isolated.sh"), str(self.run)),
             pass_fds=(fd,),
             env=os.environ | {"ABBE_LISTEN_FD": str(fd)},
         )

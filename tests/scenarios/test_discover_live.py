@@ -67,10 +67,10 @@ def test_the_proposed_run_is_measured_and_the_search_goes_on(run, start_sims, mo
 LIVE = """
 import sys
 from abbe.service import cli
-from abbe.service.discovery import discovery_engine
+from abbe.service.discovery import discover
 from tests.scenarios.test_discover_live import Asks
 
-discovery_engine.search = Asks()
+discover.search = Asks()
 sys.exit(cli.run(["discover", "june", "--machine", sys.argv[1], "--live"]))
 """
 

@@ -230,7 +230,9 @@ def _height(variance: float, u: float) -> tuple[float, float]:
 
 
 def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -> Roughness:
-    """Average height and speed over all gates, each with its likelihood, as an axis that creeps at one speed tells only their product."""
+    """Average height and speed over all gates, each with its likelihood. An axis that creeps at one speed tells only their product: then
+    the most likely gate stays, whose product is right, with the uncertainty of all.
+    """
     found = {v_c: fit.gain(g) for v_c, g in gates.items()}
     gains = np.array([gain for gain, _, _ in found.values()])
     weight = np.exp(gains - gains.max())
@@ -238,6 +240,8 @@ def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -
     size, own = np.array([_height(variance, u) for _, variance, u in found.values()]).T
     mean = float(weight @ size)
     u = float(np.sqrt(weight @ (own**2 + (size - mean) ** 2)))
+    if u >= mean:
+        return replace(rough, u_mm=u)
     return replace(rough, v_c=float(weight @ np.array([*found])), size_mm=mean, u_mm=u)
 
 

@@ -113,3 +113,14 @@ def test_reversal_is_a_figure_of_its_own_beside_the_range_of_the_means():
     assert after.value_mm == pytest.approx(abs(np.mean(after.deviation_mm)))
     assert after.u_mm == pytest.approx(before.u_mm)
     assert diagonal_figure(worn).value_mm == pytest.approx(diagonal_figure(run).value_mm)
+
+
+def test_a_drift_during_the_run_is_in_the_uncertainty_of_the_reversal():
+    start, end = diagonal_ends(MACHINE.stroke_mm + np.array([10.0, -10.0]), "pnp")
+    run = Truth(4).laser("v", straight_line(start, end, 21))
+    drifting = replace(run, deviation_mm=run.deviation_mm + 4e-3 * (run.t_s - run.t_s[0]) / np.ptp(run.t_s))
+    still, moved = reversal_figure(run), reversal_figure(drifting)
+    shift = abs(np.mean(moved.deviation_mm) - np.mean(still.deviation_mm))
+    assert shift > 1e-3
+    assert moved.u_mm > shift / 2.0
+    assert len(moved.position_mm) == 19, "at the ends the machine does not move between both readings"

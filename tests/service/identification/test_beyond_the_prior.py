@@ -37,7 +37,8 @@ def test_a_map_larger_or_less_known_than_the_prior_allows_is_not_carried_by_its_
     assert MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05, measured_mm=0.06).carried
     assert not MapAgainstPrior(predicted_mm=0.16, u_mm=0.01, prior_mm=0.05, measured_mm=0.06).carried
     assert not MapAgainstPrior(predicted_mm=0.01, u_mm=0.06, prior_mm=0.05, measured_mm=0.06).carried
-    assert not MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05, measured_mm=0.02).carried
+    assert not MapAgainstPrior(predicted_mm=0.10, u_mm=0.04, prior_mm=0.05, measured_mm=0.02).carried
+    assert MapAgainstPrior(predicted_mm=0.10, u_mm=0.01, prior_mm=0.05, measured_mm=0.02).carried, "squareness, from small circles"
 
 
 def test_a_smooth_machine_keeps_its_map(shared: Path, tmp_path: Path) -> None:

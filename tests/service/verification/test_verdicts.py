@@ -49,7 +49,7 @@ def figures(
         (figures(40), figures(10, helix=7.5), False, "helix got worse"),
         (figures(40, helix=2.0), figures(10, helix=6.9), False, "helix got worse"),
         (figures(40, reversal=2.0), figures(10, reversal=3.0), True, "40.0 → 10.0"),
-        (figures(40, reversal=2.0), figures(10, reversal=8.0), False, "mean reversal got worse"),
+        (figures(40, reversal=2.0), figures(10, reversal=8.0), False, "mean reversal of ppp got worse"),
         (figures(40, reversal=2.0), figures(10, reversal=float("nan")), False, "not a number"),
         (figures(40), figures(10, helix=None), False, "only one of the two verifications has a helix"),
         (figures(40, helix=None), figures(10), False, "only one of the two verifications has a helix"),
