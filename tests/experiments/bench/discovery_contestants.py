@@ -15,7 +15,7 @@ import numpy as np
 
 from abbe.models.arrays import F1, F2
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.candidate_bank import UNNAMED, VISIBLE_SHARE
+from abbe.models.discovery.candidate_bank import UNNAMED, VISIBLE_SHARE, taken
 from abbe.models.discovery.case import Case
 from abbe.models.discovery.discover import discover
 from abbe.models.discovery.selection import Contest
@@ -54,7 +54,7 @@ def candidates_of(case: Case, *, unnamed: bool = True) -> Candidates:
     problem = whiten(case, baseline_of(case))
     contest = Contest.of(problem, CATALOGUE)
     if unnamed:
-        contest.look_for_more((), np.zeros((0, problem.gap.size)))
+        contest.look_for_more((), taken(problem, ()))
     labels: list[str] = []
     sizes: list[int] = []
     parts = []
