@@ -75,14 +75,12 @@ def _out_and_back(run: RunData, turning_mm: Sequence[F1]) -> tuple[F1, F1, F1, F
     turns = [float((point - run.axes_mm[0]) @ run.beam) for point in turning_mm]
     places = [p for p in np.unique(s) if all(abs(p - turn) > NEAR_MM for turn in turns)]
     turn = int(np.argmax(s))
-    out = {float(p): float(v) for p, v in zip(s[: turn + 1], run.deviation_mm[: turn + 1], strict=True)}
-    back = {float(p): float(v) for p, v in zip(s[turn + 1 :], run.deviation_mm[turn + 1 :], strict=True)}
+    out, back = ({float(s[i]): i for i in way} for way in (range(turn + 1), range(turn + 1, len(s))))
     both = [float(p) for p in places if float(p) in out and float(p) in back]
     if len(both) < 3:
         raise ValueError(f"run {run.label}: fewer than 3 positions were measured out and back")
-    first, second = (dict(zip(s[part].tolist(), run.t_s[part].tolist(), strict=True)) for part in (slice(turn + 1), slice(turn + 1, None)))
-    waited_s = np.array([second[p] - first[p] for p in both])
-    return np.array(both), np.array([out[p] for p in both]), np.array([back[p] for p in both]), waited_s
+    first, second = [out[p] for p in both], [back[p] for p in both]
+    return np.array(both), run.deviation_mm[first], run.deviation_mm[second], run.t_s[second] - run.t_s[first]
 
 
 def helix_figure(run: RunData) -> VerificationFigure:

@@ -132,7 +132,7 @@ class WhitenedProblem:
     ----------
     paths : paths of the runs, with the bar directions of the fitted machine (`Baseline.along`).
     gap : array, shape (n,): reading minus the fitted simulation, mm.
-    use : array, shape (n,): 1, or 0 for readings that are left out (flagged, single laser outliers, or excess variance).
+    use : array, shape (n,): weight, 0 to 1: 0 for flagged readings and single laser outliers, less than 1 where scatter is in excess.
     theta : array, shape (p,): unknowns of the fitted simulation.
     tangent : columns of the simulation's unknowns, whitened for noise of 1 mm.
     projection : whitened gap, and the operator that projects the simulation's unknowns out of it.

@@ -35,7 +35,7 @@ def require(name: str, *places: str) -> str:
 
 
 def chromium_program() -> str:
-    """Return the path of Chromium: of its headless shell, the same engine for a third of the processor time, or of the whole browser."""
+    """Return the path of Chromium: of its headless shell, the same engine that starts in a third of the time, or of the whole browser."""
     return shutil.which("chromium-headless-shell") or require("chromium")
 
 

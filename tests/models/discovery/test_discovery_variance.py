@@ -21,6 +21,7 @@ from abbe.models.discovery.variance.scatter_effects import (
     extra_variance,
     teeth_mm2,
 )
+from abbe.models.discovery.variance.spectrum import gated_roughness, tooth_variance
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.models.effects.path import Path
 from tests.models.discovery.discovery_paths import bar, campaign, case_of_paths, circle, noise
@@ -63,6 +64,22 @@ def test_stick_slip_by_axis_and_size() -> None:
     assert first.location.axes == ("X",)
     assert abs(first.strength - 3.0) < 0.5
     assert 1.2 < first.parameters["v_c"] < 3.2
+
+
+def test_an_axis_that_creeps_at_one_speed_tells_the_scatter_there_and_no_height() -> None:
+    """Height and speed of decay have only their product in common: an average of each would be a hundred times too much."""
+    rng = np.random.default_rng(2)
+    bars = [replace(p, at=replace(p.at, v_mm_s=p.at.v_mm_s.copy())) for p in PATHS if p.kind == "bar"]
+    for k, p in enumerate(bars):
+        p.at.v_mm_s[:, 0] = 2.0 if k % 2 else 50.0
+    paths = tuple(bars)
+    creeps = [float(k % 2 and np.ptp(p.at.q_mm[:, 0]) > 0) for k, p in enumerate(paths)]
+    true = [2e-3 * p.look[:, 0] * c for p, c in zip(paths, creeps, strict=True)]  # half height of the teeth at this speed
+    rest = tuple(e + t * rng.uniform(-1.0, 1.0, p.n) / 4e-4 for p, e, t in zip(paths, noise(paths, 3), true, strict=True))
+    rough = gated_roughness(paths, rest, (4e-4,) * len(paths))[0]
+    teeth = tooth_variance(paths, 0, rough.v_c) * rough.size_mm**2 / 3.0
+    assert teeth.sum() == pytest.approx(sum(float(t @ t) / 3.0 for t in true), rel=0.3)
+    assert rough.u_mm > rough.size_mm / 2.0
 
 
 def test_few_laser_readings_that_are_off() -> None:

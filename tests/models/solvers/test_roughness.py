@@ -90,7 +90,7 @@ def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_th
 def test_poor_campaigns_never_make_a_machine_less_known_than_its_prior_or_a_map_larger_than_it_and_the_readings(seed):
     """Three runs, one corner, one diagonal, whatever is left of a campaign: nothing explodes outside of what was measured.
 
-    A step diagonal alone (401 of 500) gives such a map; it is told apart, and Abbe solves for six parameters instead.
+    A step diagonal alone (401 of 500) gives such a map. `carried` refuses it, and Abbe solves for six parameters instead.
     """
     rng = np.random.default_rng([seed, 18])
     truth = (Truth, Walk)[seed % 2](1000 + seed)
