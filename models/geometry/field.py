@@ -28,8 +28,9 @@ CORES = 2
 """Number of threads for many points. More would only wait for memory; on a single core the second costs little."""
 LEAST = 512
 """Number of points from which on it is worth testing whether they form a grid."""
-TILE = (32, 1000)
-"""Rows and columns of one product: times 8, fewer than the 2**18 multiplications from which on OpenBLAS starts threads of its own."""
+TILE = (8, 4000)
+"""Rows and columns of one product, the fastest of fifteen shapes: times 8, fewer than the 2**18 multiplications from which on OpenBLAS
+starts threads of its own."""
 
 Motions = Callable[[F2], F3]
 Lines = tuple[F1, F1, F1]
@@ -149,15 +150,15 @@ def grid_mm(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> F4:
     moved = [_own(machine, a, lines[a], motions[a]) for a in range(3)]
     of_x = np.concatenate([np.ones((nx, 1)), lines[0][:, None], moved[0], motions[0][:, 3:]], axis=1)
     of_yz = _plane(lever_masks(machine.chain), lines, moved, motions).reshape(8, -1)
-    flat = out.reshape(nx, -1)
+    flat, down = out.reshape(nx, -1), -(-nx // TILE[0])
 
-    def columns(tiles: slice) -> None:
-        for j in range(tiles.start * TILE[1], tiles.stop * TILE[1], TILE[1]):
-            for i in range(0, nx, TILE[0]):
-                tile = flat[i : i + TILE[0], j : j + TILE[1]]
-                np.matmul(of_x[i : i + TILE[0]], of_yz[:, j : j + TILE[1]], out=tile)
+    def tiles(some: slice) -> None:
+        for k in range(some.start, some.stop):
+            i, j = k % down * TILE[0], k // down * TILE[1]  # what a column of tiles shares stays in the cache
+            rows, columns = slice(i, i + TILE[0]), slice(j, j + TILE[1])
+            np.matmul(of_x[rows], of_yz[:, columns], out=flat[rows, columns])
 
-    in_blocks(-(-flat.shape[1] // TILE[1]), columns, weight=nx * TILE[1] // 3)
+    in_blocks(down * -(-flat.shape[1] // TILE[1]), tiles, weight=TILE[0] * TILE[1] // 3)
     return out
 
 
@@ -171,15 +172,15 @@ def _own(machine: Machine, axis: int, line_mm: F1, motions: F2) -> F2:
 def _plane(mask: F3, lines: Lines, moved: list[F2], motions: tuple[F2, F2, F2]) -> NDArray[np.float64]:
     """Return the factors of 1, x, EX EY EZ and EA EB EC of X as functions of the Y-Z plane, shape (8, ny, nz, 3)."""
     (_, y, z), unit = lines, np.eye(3)
-    turned = [[mask[a, b] * np.cross(motions[a][:, 3:], unit[b]) for b in range(3)] for a in range(3)]
+    y_z, y_x, z_y, z_x = (mask[a, b] * cross(motions[a][:, 3:], unit[b]) for a, b in ((1, 2), (1, 0), (2, 1), (2, 0)))
     out = np.zeros((8, y.size, z.size, 3))
-    out[0] = moved[1][:, None] + moved[2][None]
-    out[0] += turned[1][2][:, None] * z[None, :, None] + turned[2][1][None] * y[:, None, None]
-    out[1] = turned[1][0][:, None] + turned[2][0][None]
-    out[2:5] = unit[:, None, None]
+    for c in range(3):  # by component: numpy is slow where the last axis has three values
+        out[0, ..., c] = np.add.outer(moved[1][:, c], moved[2][:, c]) + np.outer(y_z[:, c], z) + np.outer(y, z_y[:, c])
+        out[1, ..., c] = np.add.outer(y_x[:, c], z_x[:, c])
+        out[2 + c, ..., c] = 1.0
     lever_y, lever_z = mask[0, 1] * y[:, None], mask[0, 2] * z[None]
-    out[5, :, :, 1], out[5, :, :, 2] = -lever_z, lever_y
-    out[6, :, :, 0], out[7, :, :, 0] = lever_z, -lever_y
+    out[5, ..., 1], out[5, ..., 2] = -lever_z, lever_y
+    out[6, ..., 0], out[7, ..., 0] = lever_z, -lever_y
     return out
 
 
