@@ -16,7 +16,7 @@ RotationForm = Literal["vector", "zyx", "small"]
 
 
 def cross(a: F2, b: F2) -> F2:
-    """Return the cross product over the last axis of two arrays of equal shape (..., 3), in a third of the time of `numpy.cross`."""
+    """Return the cross product over the last axis of two arrays (..., 3) that broadcast, in a third of the time of `numpy.cross`."""
     out = np.empty(np.broadcast(a, b).shape, dtype=np.result_type(a, b))
     out[..., 0] = a[..., 1] * b[..., 2] - a[..., 2] * b[..., 1]
     out[..., 1] = a[..., 2] * b[..., 0] - a[..., 0] * b[..., 2]

@@ -76,7 +76,7 @@ class FileChanges:
     async def change(self, asked: ChangeFile) -> Answer:
         """Change the file, or answer why it is not changed. After "done" the service starts anew.
 
-        A change that has begun is completed even if nobody waits for the answer any more, so that a written file is always used.
+        A change that has begun is completed even if the caller stops waiting, so that a written file is always used.
         """
         self._work = asyncio.ensure_future(self._carried_out(asked))
         return await asyncio.shield(self._work)
