@@ -50,9 +50,8 @@ class ControllerSession:
         """
         self._map = ""
         counts = await self._identity()
-        status = reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic()).status
         try:
-            check_clock(self.name, status.ctrl_us)
+            await check_clock(self.name, self._clock_us)
         except WrongDevice as error:
             self.incidents.note(error, latched=True)
             raise
@@ -117,6 +116,9 @@ class ControllerSession:
             raise
         self.fifo_size = counts["FIFO_SIZE"]
         return counts
+
+    async def _clock_us(self) -> int:
+        return reg.decode_status(await self.link.read_block(reg.STATUS), time.monotonic()).status.ctrl_us
 
     def _check_map(self, counts: dict[str, int]) -> None:
         """Refuse a register map that this driver does not support, or that changed since ``identify``."""

@@ -96,9 +96,8 @@ class ModbusLaser:
             Communication failed.
         """
         counts = await self._identity()
-        clock_us = decode_reading(await self._link.read_block(READING), time.monotonic()).device_us
         try:
-            check_clock(self.name, clock_us)
+            await check_clock(self.name, self._clock_us)
         except WrongDevice as error:
             self._link.incidents.note(error, latched=True)
             raise
@@ -214,6 +213,9 @@ class ModbusLaser:
             self._link.incidents.note(error, latched=True)
             raise
         return counts
+
+    async def _clock_us(self) -> int:
+        return decode_reading(await self._link.read_block(READING), time.monotonic()).device_us
 
     def _check_beam(self, status: int) -> None:
         if beam_is_gone(status):

@@ -100,6 +100,8 @@ _ORDER_NAMES = {
 _SET_ORDER = "set the device to big-endian, high word first (ABCD)"
 _WHO = "check address and unit number: they may belong to another device"
 _LONGEST_US = 100 * 365 * 86400 * 10**6
+_HOUR_US = 3600 * 10**6
+_STANDS_S = 1.0
 
 
 def _order(known: int, found: int) -> str:
@@ -129,11 +131,40 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
         raise WrongDevice(device, "identify", detail, "install the matching firmware, or the matching version of this program")
 
 
-def check_clock(device: str, device_us: int) -> None:
-    """Raise WrongDevice if the device's clock shows more than 100 years since power-on: its four registers must be in the wrong order."""
-    if device_us > _LONGEST_US:
-        detail = f"its clock reads {device_us:#018x} us since it was switched on: the registers of 64-bit values are swapped"
+async def check_clock(device: str, read_us: Callable[[], Awaitable[int]]) -> None:
+    """Check the order of the four registers of a device's clock. ``read_us`` returns the time since the device was switched on, us.
+
+    A clock in the wrong order shows more than 100 years. One reading in some hundred is possible in both orders: then the next reading that
+    differs must be at most an hour later.
+
+    Raises
+    ------
+    WrongDevice
+        The registers are in the wrong order.
+    DriverError
+        Raised by ``read_us``.
+    """
+    first_us = last_us = await read_us()
+    if 0 < first_us <= _LONGEST_US and min(_reversed(first_us)) <= _LONGEST_US:
+        last_us = await _next_reading(read_us, first_us)
+    if first_us > _LONGEST_US or not 0 <= last_us - first_us <= _HOUR_US:
+        detail = f"its clock reads {last_us:#018x} us since it was switched on: the registers of 64-bit values are swapped"
         raise WrongDevice(device, "identify", detail, _SET_ORDER)
+
+
+def _reversed(clock_us: int) -> tuple[int, int]:
+    data = clock_us.to_bytes(8, "big")
+    words = [data[at : at + 2] for at in range(0, 8, 2)]
+    return int.from_bytes(b"".join(words[::-1]), "big"), int.from_bytes(data[::-1], "big")
+
+
+async def _next_reading(read_us: Callable[[], Awaitable[int]], first_us: int) -> int:
+    """Return the next reading that differs, or the same one if the clock stands still."""
+    clock = asyncio.get_running_loop().time
+    until_s = clock() + _STANDS_S
+    while (read := await read_us()) == first_us and clock() < until_s:  # noqa: ASYNC110 - the device does not signal a new reading
+        await asyncio.sleep(_POLL_S)
+    return read
 
 
 _POLL_S = 0.005

@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 from abbe.drivers.cnc import registers as cnc
 from abbe.drivers.errors import WrongDevice
 from abbe.drivers.laser import driver as laser
+from abbe.drivers.links import words
 from abbe.drivers.links.modbus import rtu_mismatch, tcp_mismatch
-from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, check_identity, words_of
+from abbe.drivers.links.words import Register, RegisterBlock, bytes_of, check_clock, check_identity, words_of
 
 READ = bytes.fromhex("0007 0000 0006 01 03 0064 0002")
 WRITE = bytes.fromhex("0008 0000 000B 01 10 0064 0002 04 0001 0002")
@@ -119,3 +120,34 @@ def test_a_good_reply_fits_at_every_length_and_any_change_of_a_fixed_byte_does_n
             assert tcp_mismatch(sent, bytes(damaged)) != ""
     assert "too many" in tcp_mismatch(sent, good + b"\x00")
     assert "too many" in rtu_mismatch(sent[6:] + b"\x00\x00", good[6:] + b"\x00\x00\x00")
+
+
+ORDERS = {
+    "ABCD": lambda data: data,
+    "CDAB": lambda data: b"".join(data[at : at + 2] for at in (6, 4, 2, 0)),
+    "DCBA": lambda data: data[::-1],
+}
+
+
+@pytest.mark.parametrize("order", ORDERS)
+@pytest.mark.parametrize("clock_us", [3_000_000, 2_999_808, 0x0B00_0100, 0x0001_0000, 40 * 365 * 86400 * 10**6], ids=hex)
+async def test_a_clock_in_the_wrong_order_is_refused_even_if_one_reading_is_possible(order, clock_us):
+    shown = iter([clock_us, clock_us, clock_us + 50_000, clock_us + 100_000])
+
+    async def read_us() -> int:
+        return int.from_bytes(ORDERS[order](next(shown).to_bytes(8, "big")), "big")
+
+    if order == "ABCD":
+        await check_clock("laser", read_us)
+        return
+    with pytest.raises(WrongDevice, match="64-bit values are swapped"):
+        await check_clock("laser", read_us)
+
+
+async def test_a_clock_that_stands_still_says_nothing_of_its_order(monkeypatch):
+    monkeypatch.setattr(words, "_STANDS_S", 0.0)
+
+    async def read_us() -> int:
+        return 0x0001_0000
+
+    await check_clock("laser", read_us)

@@ -68,7 +68,8 @@ async def entered(stream) -> None:
         pass
 
 
-async def test_restart_in_the_middle(tmp_path):
+async def test_restart_in_the_middle(tmp_path, monkeypatch):
+    be_patient(monkeypatch, sample_s=3.0)  # a restarted box is found by its silence
     await together([reboot(tmp_path, moment, after) for moment in S6_MOMENTS for after in S6_AFTER])
 
 
