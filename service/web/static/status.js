@@ -6,6 +6,7 @@ import { answered } from "./stop.js";
 
 const PERIOD_MS = 2000;
 const PATIENCE_MS = 5000;
+const LOGOUT_MS = 60000;  // a busy computer takes long to log a person out
 
 const banner = document.getElementById("lost");
 const words = JSON.parse(document.body.dataset.words);
@@ -92,9 +93,9 @@ function ask(path, active) {
   return fetch(path, { headers: { "X-Abbe-Active": active ? "1" : "0" }, signal: one.signal });
 }
 
-// Whoever logs out asks nothing more: the answer would be a refusal.
+// Whoever logs out asks nothing more: the answer would be a refusal. A page that is still there after a while is shown as stale.
 document.getElementById("logout")?.form.addEventListener("submit", () => {
-  quietUntil = performance.now() + PATIENCE_MS;
+  quietUntil = performance.now() + LOGOUT_MS;
   asking.abort();
 });
 
@@ -133,7 +134,12 @@ function loggedOut() {
 }
 
 async function refresh() {
-  if (performance.now() < quietUntil) { setTimeout(refresh, PERIOD_MS); return; }
+  const quiet = quietUntil - performance.now();
+  if (quiet > 0) {
+    if (quiet < LOGOUT_MS - PATIENCE_MS) connected(false);
+    setTimeout(refresh, PERIOD_MS);
+    return;
+  }
   let silent = false;
   try {
     const active = touched;
