@@ -67,12 +67,22 @@ def wave(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     return read_together(paths, lambda at: _along(key[1], _turns(at.q_mm[:, axis] / values["pitch_mm"])))
 
 
+def wave_second(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
+    """Return columns of the second harmonic of `wave`."""
+    return wave(paths, key, {"pitch_mm": values["pitch_mm"] / 2.0})
+
+
 def surge(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     """Return columns of a wave in time with ``period_s``: of an axis (``"X"``) or of an instrument's reading (``"bar"``, ``"laser"``)."""
     period = values["period_s"]
     if key in AXES:
         return read_together(paths, lambda at: _along(key, _turns(at.t_s / period)))
     return [UM * (_turns(p.at.t_s / period) - _turns(p.reference.t_s / period)) if p.kind == key else np.zeros((p.n, 2)) for p in paths]
+
+
+def surge_second(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
+    """Return columns of the second harmonic of `surge`: a pump, a thermostat or a counterbalance repeats, but not as a sine."""
+    return surge(paths, key, {"period_s": values["period_s"] / 2.0})
 
 
 def step(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -127,10 +137,21 @@ def lobes(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
     return [UM * _lobed(p.look, polar, number) if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
 
 
-def lobe_latitude(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
-    """Return columns of lobes (`lobes`) whose height changes linearly with the sine of the bar's latitude."""
-    polar, number = AXES.index(key[0]), int(key[1:])
-    return [UM * _lobed(p.look, polar, number) * p.look[:, polar, None] if p.kind == "bar" else np.zeros((p.n, 2)) for p in paths]
+def _lobes_by_latitude(power: int) -> Signal:
+    """Make the signal of lobes (`lobes`) whose height goes with a power of the sine of the bar's latitude.
+
+    On a smooth ball, lobes of constant height are impossible: they would meet at the pole. In spherical harmonics of order m their height
+    is the cosine of the latitude to the power of m, times a polynomial in its sine; the first two powers follow it where bars can read.
+    """
+
+    def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
+        polar = AXES.index(key[0])
+        return [c * p.look[:, polar, None] ** power for c, p in zip(lobes(paths, key, values), paths, strict=True)]
+
+    return signal
+
+
+LOBE_FORMS = (Form("latitude", _lobes_by_latitude(1)), Form("latitude squared", _lobes_by_latitude(2)))
 
 
 def _lobed(look: F2, polar: int, number: int) -> F2:
@@ -278,7 +299,7 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
         _effect("smooth", "smooth function of one axis", COMPONENTS, (), absorbed_by=("rigid21",)),
         # Along the axis itself this has a name: backlash that depends on the position.
         _effect("odd", "function of one axis that turns its sign with the direction", CROSS, ()),
-        _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=(Form("latitude", lobe_latitude),)),
+        _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=LOBE_FORMS),
     ]
     clock, tau = (0.0, end), Parameter("tau_s", "s", 20.0, 900.0, 120.0, SOURCE, (120.0,))
     # An effect has one set of starts for all its keys, so kinds with starts of their own for each key become one effect per key.
@@ -289,11 +310,11 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     for key in (*AXES, *sorted(kinds)):
         shortest = max(PERIODS_S[0], _resolved_s([p for p in paths if key in (*AXES, p.kind)]))
         resolved = tuple(v for v in starts["surge"][key] if v >= shortest)
-        out.append(
-            _effect("surge", "wave on the clock", (key,), (_par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), resolved),))
-        )
+        period = _par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), resolved)
+        out.append(_effect("surge", "wave on the clock", (key,), (period,), forms=(Form("second harmonic", surge_second),)))
     for key in CROSS:
-        out.append(_effect("wave", "wave along one axis across it", (key,), (_par("pitch_mm", PITCHES_MM, starts["wave"][key]),)))
+        pitch = _par("pitch_mm", PITCHES_MM, starts["wave"][key])
+        out.append(_effect("wave", "wave along one axis across it", (key,), (pitch,), forms=(Form("second harmonic", wave_second),)))
     width = Parameter("width_mm", "mm", 8.0, 45.0, 20.0, SOURCE, WIDTHS_MM)
     out.append(_effect("bump", "bump at one place", ("",), (_par("at_s", clock, starts["bump"][""]), width)))
     b = starts["burst"]

@@ -29,6 +29,10 @@ def wave(at: Places, key: str, values: Values) -> F3:
 
 
 def _second(at: Places, key: str, values: Values) -> F3:
+    """Return the second harmonic: the signals' offsets make a wave of an encoder's period, unequal gains and phase error one of half of it.
+
+    Source: Heydemann, Appl. Opt. 20 (1981) 3382.
+    """
     return along(axis_of(key), *_waves(at, key, values, 2))
 
 
