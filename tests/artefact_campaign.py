@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -30,6 +31,15 @@ def error_mm(x: Vectors, y: Vectors) -> Vectors:
     return np.stack([-60e-6 * u - 30e-6 * v + 1.5e-7 * v**2, 25e-6 * v - 1e-7 * u**2 + 2e-10 * u**3], axis=1)
 
 
+def screws_mm(x: Vectors, y: Vectors) -> Vectors:
+    """`error_mm` on screws of 10 mm lead that err by 2.5 um, and by 1 um with 13.33 mm."""
+    waves = [2.5e-3 * np.sin(2.0 * np.pi * a / 10.0 + i) + 1e-3 * np.cos(6.0 * np.pi * a / 40.0 + i) for i, a in enumerate((x, y))]
+    return error_mm(x, y) + np.stack(waves, axis=1)
+
+
+Error = Callable[[Vectors, Vectors], Vectors]
+
+
 def names() -> list[str]:
     """Ids of 25 holes, row by row."""
     return [f"{c}{r}" for r in range(1, 6) for c in "ABCDE"]
@@ -40,8 +50,11 @@ def nominal() -> Vectors:
     return np.array([[i % 5 * PITCH_MM, i // 5 * PITCH_MM] for i in range(25)])
 
 
-def campaign(folder: Path, *, seed: int = 1, length: bool = True, noise_mm: float = 2e-4, turned: str = "") -> Path:
-    """Write the campaign and return the folder; ``turned``: run whose plate lies a quarter turn further about its centre than stated."""
+def campaign(
+    folder: Path, *, seed: int = 1, length: bool = True, noise_mm: float = 2e-4, turned: str = "", error: Error = error_mm
+) -> Path:
+    """Write the campaign and return the folder; ``turned``: run whose plate lies a quarter turn further about its centre than stated;
+    ``error``: the machine's."""
     rng = np.random.default_rng(seed)
     form = 0.02 * rng.standard_normal((25, 2))
     n = nominal()
@@ -58,7 +71,7 @@ def campaign(folder: Path, *, seed: int = 1, length: bool = True, noise_mm: floa
     }  # fmt: skip
     entries = []
     for k, (quarter, origin) in enumerate(POSES, start=1):
-        run = _run(f"p{k}", 600.0 * k, quarter, np.array(origin), _quarter(form) if turned == f"p{k}" else form, rng, noise_mm)
+        run = _run(f"p{k}", 600.0 * k, quarter, np.array(origin), _quarter(form) if turned == f"p{k}" else form, rng, noise_mm, error)
         entries.append({"run_id": f"p{k}", "test": "artefact_points", "role": "identify", "file": f"p{k}.json"})
         head["setups"][f"p{k}"] = {"kind": "artefact", "t_set_s": 600.0 * k}  # type: ignore[index]
         (folder / f"p{k}.json").write_text(json.dumps(run))
@@ -72,14 +85,16 @@ def _quarter(form: Vectors) -> Vectors:
     return np.stack([-form[at, 1], form[at, 0]], axis=1)
 
 
-def _run(label: str, t_s: float, quarter: int, origin: Vectors, form: Vectors, rng: np.random.Generator, noise_mm: float) -> dict[str, Any]:
+def _run(
+    label: str, t_s: float, quarter: int, origin: Vectors, form: Vectors, rng: np.random.Generator, noise_mm: float, error: Error
+) -> dict[str, Any]:
     """Points of one pose: the plate lies 0.05 mm and 0.2 mrad off, and is warm."""
     c, s = ((1, 0), (0, 1), (-1, 0), (0, -1))[quarter]
     matrix = np.array([[c, -s], [s, c]], dtype=np.float64)
     shift, turn = 0.05 * rng.standard_normal(2), 2e-4 * rng.standard_normal()
     true = (nominal() + form) * (1.0 + EXPANSION * WARM_K)
     lies = origin + shift + (true + turn * np.stack([-true[:, 1], true[:, 0]], axis=1)) @ matrix.T
-    found = lies - error_mm(*lies.T) + noise_mm * rng.standard_normal((25, 2))
+    found = lies - error(*lies.T) + noise_mm * rng.standard_normal((25, 2))
     deviation = (found - origin) @ matrix - nominal()
     columns = {
         "t_s": [t_s + 6.0 * i for i in range(25)], "x_mm": found[:, 0].tolist(), "y_mm": found[:, 1].tolist(), "z_mm": [200.0] * 25,

@@ -15,9 +15,8 @@ from typing import Literal
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.chain import design
-from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import ArtefactPoints, form_rows
+from abbe.models.solvers.artefact_motion import fine_of, motion_rows, unfollowed_mm2
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.poses import NAMED, PoseRank, stated_places
 
@@ -81,22 +80,19 @@ def field_shares(joint: JointSolution, rank: PoseRank) -> tuple[Share, ...]:
     form = form_amounts(p, places, e.names)
     at = np.concatenate([stated_places(r.axes_mm, q.matrix, q.nominal_mm, keep) for r, q in probed])
     middle, off = 0.5 * (at.min(axis=0) + at.max(axis=0)), next(k for k in range(3) if k not in keep)
-    machine = np.zeros((len(NAMED), len(e.names)))
     points = np.insert(at, off, float(np.mean([r.axes_mm[:, off].mean() for r, _ in probed])), axis=1)
-    rows = design(with_tool(joint.machine, run.tool_mm), joint.terms, points)[:, keep].reshape(2 * len(at), -1)
-    machine[:, : len(joint.terms)] = _weights((at - middle) / p.reach_mm) @ rows
+    weights = np.zeros((len(NAMED), len(at), 3))
+    weights[:, :, keep] = _weights((at - middle) / p.reach_mm).reshape(len(NAMED), -1, 2)
+    machine = np.tensordot(weights, motion_rows(joint, run.tool_mm, points, fine_of(joint)), 2)
+    unfollowed = unfollowed_mm2(joint, points, weights)
     sign = np.array([_turned(name, p.matrix[keep][:, :2]) for name in NAMED])  # as the part lies in the first pose
     out = []
     for i, name in enumerate(NAMED):
-        both = sign[i] * form[i] - machine[i]
-        (part, u_part), (own, u_own), (sum_, u_sum) = (_known(e.theta, e.covariance, w) for w in (sign[i] * form[i], machine[i], both))
-        nats = [
-            _evidence(v, u, w, joint.prior_root) for v, u, w in ((part, u_part, form[i]), (own, u_own, machine[i]), (sum_, u_sum, both))
-        ]
-        seen = [n > NATS and abs(v) > LEAST_MM for n, v in zip(nats, (part, own, sum_), strict=True)]
-        out.append(
-            Share(name, part, u_part, nats[0], own, u_own, nats[1], sum_, u_sum, _verdict(seen, hidden=name in rank.hidden), p.reach_mm)
-        )
+        asked = ((sign[i] * form[i], 0.0), (machine[i], unfollowed[i]), (sign[i] * form[i] - machine[i], unfollowed[i]))
+        (part, u_part, part_nats), (own, u_own, own_nats), (sum_, u_sum, nats) = (_known(joint, *one) for one in asked)
+        seen = [n > NATS and abs(v) > LEAST_MM for n, v in ((part_nats, part), (own_nats, own), (nats, sum_))]
+        verdict = _verdict(seen, hidden=name in rank.hidden)
+        out.append(Share(name, part, u_part, part_nats, own, u_own, own_nats, sum_, u_sum, verdict, p.reach_mm))
     return tuple(out)
 
 
@@ -109,15 +105,14 @@ def _verdict(seen: list[bool], *, hidden: bool) -> Verdict:
     return "with the part" if part else "with the machine" if machine else "unknown" if both else "none"
 
 
-def _known(theta: F1, covariance: F2, weights: F1) -> tuple[float, float]:
-    return float(weights @ theta), float(np.sqrt(max(float(weights @ covariance @ weights), 0.0)))
-
-
-def _evidence(value: float, u: float, weights: F1, prior_root: F2) -> float:
-    before = float(np.linalg.norm(weights @ prior_root))
+def _known(joint: JointSolution, weights: F1, unfollowed_mm2: float) -> tuple[float, float, float]:
+    """Value and standard uncertainty of a sum of unknowns, and the evidence that it is not zero."""
+    value = float(weights @ joint.estimate.theta)
+    u = float(np.sqrt(max(float(weights @ joint.estimate.covariance @ weights), 0.0) + unfollowed_mm2))
+    before = float(np.sqrt(np.sum((weights @ joint.prior_root) ** 2) + unfollowed_mm2))
     if u <= 0.0 or before <= 0.0:
-        return 0.0
-    return float(0.5 * (value / u) ** 2 - np.log(max(before / u, 1.0)))
+        return value, u, 0.0
+    return value, u, float(0.5 * (value / u) ** 2 - np.log(max(before / u, 1.0)))
 
 
 def _turned(name: str, turn: F2) -> float:

@@ -33,8 +33,9 @@ APART = 4
 """Least number of coarse steps between the two periods of a pair: closer periods are one period with a changing amplitude."""
 LIKELY, MOST = 60, 700
 """`LIKELY`: number of pairs whose neighbourhood is searched finely. `MOST`: largest number of coarse frequencies from which pairs are
-formed, those that are best alone.
-"""
+formed, those that are best alone."""
+BLOCK = 16
+"""Number of first frequencies of pairs that are taken at once; their arrays stay in the cache."""
 SCATTER_MM = tuple(float(v) for v in np.geomspace(3e-5, 4e-3, 9))
 """Standard deviations of the scatter from position to position that are tried, equally probable."""
 
@@ -146,12 +147,12 @@ def _evidence(data: Displacements, levels: list[tuple[F1, F2, float]], axes: tup
 def _pairs(
     data: Displacements, levels: list[tuple[F1, F2, float]], axes: tuple[int, ...], frequency: F1, log_prior: F1, single: F1
 ) -> Pair:
-    """Pairs of frequencies near the best pairs of a coarse search, in which the axes are taken as independent; each pair once."""
+    """Pairs of frequencies near the best pairs of a coarse search; each pair once."""
     step = round(COARSE / FINE)
     coarse = np.arange(0, frequency.size, step)
     coarse = np.sort(coarse[np.argsort(-single[coarse])[:MOST]])
-    waves = [data.waves((a,), frequency[coarse]) for a in axes]
-    value = _mixed([base + np.sum([_gain_of_pairs(w, h, information) for w in waves], axis=0) for h, information, base in levels[::2]])
+    waves = data.waves(axes, frequency[coarse])
+    value = _mixed([base + gain_of_pairs(waves, h, information) for h, information, base in levels[::2]])
     one, two = np.nonzero(coarse[None, :] - coarse[:, None] >= APART * step)
     best = np.argsort(-(value[one, two] + log_prior[coarse[one]] + log_prior[coarse[two]]))[:LIKELY]
     shift = np.arange(-NEAR, NEAR + 1)
@@ -160,20 +161,45 @@ def _pairs(
     return pairs[:, 0], pairs[:, 1]
 
 
-def _gain_of_pairs(waves: NDArray[np.float64], h: F1, information: F2) -> F2:
-    """Log evidence of every pair of frequencies on one axis minus that of none, shape (frequencies, frequencies); waves (f, n, 2)."""
-    f = len(waves)
-    flat = waves.transpose(1, 0, 2).reshape(h.size, -1)
-    asked, across = (flat.T @ h).reshape(f, 2), (flat.T @ information @ flat).reshape(f, 2, f, 2).transpose(0, 2, 1, 3)
-    own = across[np.arange(f), np.arange(f)] + np.eye(2)
-    first = np.linalg.inv(own)
-    taken = np.swapaxes(across, -1, -2) @ first[:, None]  # (one, two, of two, of one)
-    left = asked[None] - (taken @ asked[:, None, :, None])[..., 0]
-    a, b, d = (own[:, i, j] - (taken[..., i, :] * across[..., :, j]).sum(axis=-1) for i, j in ((0, 0), (0, 1), (1, 1)))
-    volume = a * d - b * b
-    u, v = left[..., 0], left[..., 1]
-    alone = 0.5 * np.einsum("fi,fij,fj->f", asked, first, asked) - 0.5 * np.log(np.linalg.det(own))
-    return np.asarray(alone[:, None] + 0.5 * (d * u * u - 2.0 * b * u * v + a * v * v) / volume - 0.5 * np.log(np.maximum(volume, 1e-12)))
+def gain_of_pairs(waves: NDArray[np.float64], h: F1, information: F2) -> F2:
+    """Log evidence of every pair of frequencies minus that of none, shape (f, f), valid above the diagonal.
+
+    ``waves`` (f, n, k): displacements by the k waves of each frequency. The waves are scaled so that each frequency alone has the unit
+    matrix as posterior precision; what a second frequency adds then needs only the k x k blocks across, row by row of blocks.
+    """
+    f, n, k = waves.shape
+    back = np.linalg.inv(np.linalg.cholesky(waves.transpose(0, 2, 1) @ (information @ waves) + np.eye(k)))
+    white = np.ascontiguousarray((waves @ back.transpose(0, 2, 1)).transpose(1, 2, 0))  # (n, k, f)
+    asked, volume = np.einsum("n,nkf->kf", h, white), np.log(np.diagonal(back, axis1=1, axis2=2)).sum(axis=1)
+    known = (information @ white.reshape(n, -1)).reshape(white.shape)
+    out = np.zeros((f, f))
+    for start in range(0, f, BLOCK):
+        rows, columns = slice(start, start + BLOCK), slice(start, f)
+        across = np.tensordot(white[..., rows], known[..., columns], (0, 0)).transpose(0, 2, 1, 3)  # (of one, of two, one, two)
+        alone = 0.5 * (asked[:, rows] ** 2).sum(axis=0) + volume[rows]
+        beside = _gain_beside(np.ascontiguousarray(across), asked[:, rows], asked[:, columns])
+        out[rows, columns] = alone[:, None] + volume[columns] + beside
+    return out
+
+
+def _gain_beside(across: NDArray[np.float64], one: F2, two: F2) -> F2:
+    """Log evidence that a second frequency adds to a first one, by elimination of one wave after the other, shape (first, second).
+
+    ``across`` (k, k, first, second), ``one`` (k, first), ``two`` (k, second), of waves scaled as in `gain_of_pairs`.
+    """
+    k = len(across)
+    left = [two[i] - sum(across[w, i] * one[w, :, None] for w in range(k)) for i in range(k)]
+    whole = [[(i == j) - sum(across[w, i] * across[w, j] for w in range(k)) for j in range(i + 1)] for i in range(k)]
+    out = np.zeros(across.shape[2:])
+    for j in range(k):
+        pivot = np.maximum(whole[j][j], 1e-12)
+        out += 0.5 * left[j] ** 2 / pivot - 0.5 * np.log(pivot)
+        for i in range(j + 1, k):
+            ratio = whole[i][j] / pivot
+            left[i] = left[i] - ratio * left[j]
+            for m in range(j + 1, i + 1):
+                whole[i][m] = whole[i][m] - ratio * whole[m][j]
+    return out
 
 
 def _peaks(axes: tuple[int, ...], frequency: F1, weight: F1, span_mm: float) -> list[Peak]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from abbe.models.solvers.artefact_motion import fine_of
 from abbe.models.solvers.artefact_shares import Share, field_shares
 from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.models.solvers.observability.poses import PoseRank, pose_rank
@@ -57,8 +58,7 @@ def artefact_finding(campaign: Campaign) -> ArtefactFinding:
     """Solve the campaign and separate part and machine. Raises as `solve_runs`."""
     solved = solve_runs(campaign.site, campaign.runs, instruments=campaign.doc.get("instruments"))
     joint, rank = solved.joint, pose_rank(solved.joint.data)
-    fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
-    waves = dict.fromkeys(f"a wave of {w.period_mm:.4g} mm along {'XYZ'[w.axis]}" for w in fine if w.period_mm)
+    waves = dict.fromkeys(f"a wave of {w.period_mm:.4g} mm along {'XYZ'[w.axis]}" for w in fine_of(joint) if w.period_mm)
     scatter = joint.noise_mm["artefact"] / DEFAULT_SIGMA_MM["artefact"]
     return ArtefactFinding(campaign.name, solved, rank, () if rank is None else field_shares(joint, rank), tuple(waves), scatter)
 

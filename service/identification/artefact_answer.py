@@ -5,15 +5,12 @@ from __future__ import annotations
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.geometry.bases import SMOOTH_ORDER
-from abbe.models.geometry.chain import design
-from abbe.models.machine import with_tool
 from abbe.models.solvers.artefact import Fine
+from abbe.models.solvers.artefact_motion import above_orders_mm2, fine_of, motion_rows
 from abbe.models.solvers.artefact_shares import field_shares, shares_text
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.poses import are_tilted, pose_rank
 from abbe.models.solvers.plate_fit import plate_fit
-from abbe.models.solvers.priors import ROUGH_LENGTH_MM, Priors, rough_root
 
 SENSED = 1e-3
 """An axis is not sensed if no reading of the campaign has a larger direction cosine along it."""
@@ -52,21 +49,16 @@ def unsensed_axis(joint: JointSolution) -> int | None:
 def deviation_of_artefacts(joint: JointSolution, points_mm: F2) -> tuple[F2, F2, str]:
     """Return deviation and expanded uncertainty (k = 2) at points, mm, shape (n, 3) each, NaN where not sensed, and the frame in words."""
     tool = next(run.tool_mm for run in joint.data if run.points is not None and run.points.source != "length")
-    at, chosen = design(with_tool(joint.machine, tool), joint.terms, points_mm), np.arange(len(joint.terms))
     waves, scatter_mm = _fine(joint, points_mm)
-    names = joint.estimate.names
-    if waves:
-        chosen = np.concatenate([chosen, [names.index(w.name) for w in waves]])
-        at = np.concatenate([at, np.stack([np.outer(w.values(points_mm), np.eye(3)[w.component]) for w in waves], axis=2)], axis=2)
+    at = motion_rows(joint, tool, points_mm, waves)
     axis, free = unsensed_axis(joint), without_length(joint)
     keep = [k for k in range(3) if k != axis]
-    rows = at[:, keep].reshape(-1, len(chosen))
+    rows = at[:, keep].reshape(-1, at.shape[2])
     basis, _ = np.linalg.qr(_frame(points_mm, keep, scale=free))
     rows = rows - basis @ (basis.T @ rows)
-    covariance = joint.estimate.covariance[np.ix_(chosen, chosen)]
-    u: F1 = np.sqrt(np.maximum(np.einsum("ij,jk,ik->i", rows, covariance, rows), 0.0))
+    u: F1 = np.sqrt(np.maximum(np.sum(rows @ joint.estimate.covariance * rows, axis=1), 0.0))
     deviation, expanded = np.full((2, len(points_mm), 3), np.nan)
-    value, spread = (rows @ joint.estimate.theta[chosen]).reshape(-1, len(keep)), np.hypot(u.reshape(-1, len(keep)), scatter_mm[keep])
+    value, spread = (rows @ joint.estimate.theta).reshape(-1, len(keep)), np.hypot(u.reshape(-1, len(keep)), scatter_mm[keep])
     share = _offered(value, spread)
     deviation[:, keep], expanded[:, keep] = share * value, COVERAGE * np.hypot(spread, (1.0 - share) * value)
     plane, scale = (" in the plane", NOT_SENSED) if axis is not None else ("", ""), (" and common scale", NO_LENGTH) if free else ("", "")
@@ -99,27 +91,13 @@ def _offered(value_mm: F2, u_mm: F2) -> float:
 
 def _fine(joint: JointSolution, points_mm: F2) -> tuple[tuple[Fine, ...], F1]:
     """Return the waves of the machine's motions, and for each direction the variation from one position to the next, mm."""
-    fine = next((run.points.fine for run in joint.data if run.points is not None and run.points.fine), ())
+    fine = fine_of(joint)
     scatter = np.zeros(3)
     for one in fine:
         if not one.period_mm:
             scatter[one.component] = joint.prior_sd[joint.estimate.names.index(one.name)]
     moving = np.ptp(points_mm, axis=0) > SENSED
-    return tuple(one for one in fine if one.period_mm), np.hypot(scatter, np.sqrt(moving @ _above_rough(joint)))
-
-
-def _above_rough(joint: JointSolution) -> F1:
-    """Return the variance of each axis' rough motion above the orders of the model, mm^2, shape (3,); zero without rough motions."""
-    last = max(t.order for t in joint.terms)
-    if last <= SMOOTH_ORDER:
-        return np.zeros(3)
-    size = Priors().rough_mm * joint.size_factors.get("rough", 1.0) * joint.size_factors.get("machine", 1.0)
-    shares = []
-    for length in joint.machine.length_mm:
-        root = rough_root(0, last, ROUGH_LENGTH_MM / float(length))
-        inside = float(((root**2).sum(axis=1) / (2.0 * np.arange(last + 1) + 1.0)).sum())
-        shares.append(size**2 * max(1.0 - inside, 0.0))
-    return np.array(shares)
+    return tuple(one for one in fine if one.period_mm), np.hypot(scatter, np.sqrt(moving @ above_orders_mm2(joint)))
 
 
 def _frame(points_mm: F2, keep: list[int], *, scale: bool) -> F2:

@@ -6,15 +6,18 @@ import numpy as np
 import pytest
 
 from abbe.models.solvers.fine import SURE
-from abbe.models.solvers.waves import Displacements, peaks
+from abbe.models.solvers.waves import Displacements, gain_of_pairs, peaks
 
 PITCH_MM = 56.8
 SIGMA_MM = 3e-4
 SEEDS = 6 if os.environ.get("ABBE_TEST_LONG") == "1" else 3
 
 
-def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0) -> Displacements:
-    """Displacements at six features a pitch apart in four poses on X and Y, less a straight line that nobody knows."""
+def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0, *, form: bool = False) -> Displacements:
+    """Displacements at six features a pitch apart in four poses on X and Y, less a straight line that nobody knows.
+
+    ``form``: nor are the places of the features; the poses are 0, 90, 180 and 270 degrees, so X and Y read the same features.
+    """
     rng = np.random.default_rng(seed)
     place = np.concatenate([start + PITCH_MM * np.arange(6) for start in (103.1, 131.7, 74.9, 166.3)])
     at, axis = np.tile(place, 2), np.repeat([0, 1], place.size)
@@ -23,9 +26,36 @@ def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0) ->
         (1e-3 * size * np.sin(2.0 * np.pi * at / period + phase[axis, k]) for k, (period, size) in enumerate(waves_um.items())),
         1e-3 * scatter_um * rng.standard_normal(at.size),
     )
-    line = np.stack([np.where(axis == a, v, 0.0) for a in (0, 1) for v in (np.ones(at.size), at - at.mean())], axis=1)
-    known = (np.eye(at.size) - line @ np.linalg.pinv(line)) / SIGMA_MM**2
+    unknown = [np.where(axis == a, v, 0.0) for a in (0, 1) for v in (np.ones(at.size), at - at.mean())]
+    if form:
+        pose, column = np.divmod(np.tile(np.arange(place.size), 2), 6)
+        side, turned = (axis + pose) % 2, pose >= 2
+        feature = np.where(turned, 5 - column, column)
+        unknown += [1.0 * ((axis == a) & (pose == p)) for a in (0, 1) for p in range(4)]
+        unknown += [np.where(turned, -1.0, 1.0) * ((side == s) & (feature == c)) for s in (0, 1) for c in range(6)]
+    hidden = np.stack(unknown, axis=1)
+    known = (np.eye(at.size) - hidden @ np.linalg.pinv(hidden)) / SIGMA_MM**2
     return Displacements(axis, at, known @ (true + SIGMA_MM * rng.standard_normal(at.size)), known)
+
+
+def test_the_evidence_of_a_pair_is_that_of_all_its_waves_at_once() -> None:
+    data, frequency = touched({10.0: 2.0, 40.0 / 3.0: 1.0}, 1, form=True), np.array([0.03, 0.075, 0.1])
+    waves = data.waves((0, 1), frequency)
+    gain = gain_of_pairs(waves, data.h, data.information)
+    for one, two in ((0, 1), (0, 2), (1, 2)):
+        both = np.concatenate([waves[one], waves[two]], axis=1)
+        whole, asked = np.eye(8) + both.T @ data.information @ both, both.T @ data.h
+        assert gain[one, two] == pytest.approx(0.5 * asked @ np.linalg.solve(whole, asked) - 0.5 * np.linalg.slogdet(whole)[1], rel=1e-9)
+
+
+def test_two_periods_are_found_where_only_both_axes_together_show_them() -> None:
+    """The features' places are unknown, so almost any pair fits one axis alone: a search axis by axis finds 2 pairs of 8."""
+    pairs = 0
+    for seed in range(8):
+        found = peaks(touched({10.0: 2.0, 40.0 / 3.0: 1.0}, seed, form=True))
+        assert any(p.weight > SURE and abs(p.frequency - 0.1) < 3.0 * p.u_frequency for p in found), seed
+        pairs += any(p.weight > 0.3 and abs(p.frequency - 0.075) < 3.0 * p.u_frequency for p in found)
+    assert pairs >= 6
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))

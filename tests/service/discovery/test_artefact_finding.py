@@ -13,8 +13,8 @@ from abbe.models.solvers.artefact_shares import _verdict
 from abbe.models.solvers.observability.poses import NAMED, stated_places
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.cli.app import app
-from abbe.service.discovery.artefact_finding import artefact_finding
-from tests.artefact_campaign import campaign, error_mm, nominal
+from abbe.service.discovery.artefact_finding import ArtefactFinding, artefact_finding
+from tests.artefact_campaign import Error, campaign, error_mm, nominal, screws_mm
 
 REACH_MM = float(np.hypot(111.0, 111.0))
 
@@ -30,20 +30,36 @@ def amounts(q: np.ndarray, moved: np.ndarray) -> list[float]:
     return np.linalg.lstsq(np.stack(columns, -1).reshape(2 * len(q), -1), moved.ravel(), rcond=None)[0][3:].tolist()
 
 
-@pytest.mark.parametrize("seed", [1, 2])
-def test_the_amounts_of_part_and_machine_are_those_that_were_put_in(tmp_path: Path, seed: int) -> None:
-    found = artefact_finding(from_folder(campaign(tmp_path, seed=seed)))
+def found_and_true(folder: Path, seed: int, error: Error) -> tuple[ArtefactFinding, list[float], list[float]]:
+    """The finding, and the true amounts of the named fields in part and machine, mm."""
+    found = artefact_finding(from_folder(campaign(folder, seed=seed, error=error)))
     form = 0.02 * np.random.default_rng(seed).standard_normal((25, 2))
-    part = amounts((nominal() - 111.0) / REACH_MM, form)
     probed = [r for r in found.solved.joint.data if r.points.source == "probe"]
     at = np.concatenate([stated_places(r.axes_mm, r.points.matrix, r.points.nominal_mm, [0, 1]) for r in probed])
-    machine = amounts((at - 0.5 * (at.min(axis=0) + at.max(axis=0))) / REACH_MM, error_mm(*at.T))
+    machine = amounts((at - 0.5 * (at.min(axis=0) + at.max(axis=0))) / REACH_MM, error(*at.T))
+    return found, amounts((nominal() - 111.0) / REACH_MM, form), machine
+
+
+@pytest.mark.parametrize("seed", [1, 2])
+def test_the_amounts_of_part_and_machine_are_those_that_were_put_in(tmp_path: Path, seed: int) -> None:
+    found, part, machine = found_and_true(tmp_path, seed, error_mm)
     for share, p, m in zip(found.shares, part, machine, strict=True):
         assert abs(share.part_mm - p) < 3.0 * share.u_part_mm + 2e-5, share
         assert abs(share.machine_mm - m) < 3.0 * share.u_machine_mm + 2e-5, share
         if abs(m) > 1e-3 or abs(m) < 2e-4:
             assert (share.verdict in ("with the machine", "with both")) == (abs(m) > 1e-3), share
     assert "squareness" in found.verdict
+
+
+def test_the_amounts_of_a_machine_with_screw_errors_lie_within_their_uncertainty(tmp_path: Path) -> None:
+    z = []
+    for seed in (1, 2):
+        (tmp_path / str(seed)).mkdir()
+        found, part, machine = found_and_true(tmp_path / str(seed), seed, screws_mm)
+        z += [(s.machine_mm - m) / s.u_machine_mm for s, m in zip(found.shares, machine, strict=True)]
+        z += [(s.part_mm - p) / s.u_part_mm for s, p in zip(found.shares, part, strict=True)]
+    assert np.abs(z).max() < 3.0
+    assert np.sqrt(np.mean(np.square(z))) < 1.3
 
 
 def test_what_only_the_reading_shows_is_unknown_and_not_none():
