@@ -8,6 +8,7 @@ from functools import cached_property
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2
@@ -124,7 +125,10 @@ class Bank:
     logs: F1
 
     def gains(self, y: F1, rows: F2) -> F1:
-        """Reduction of chi-square of readings y by each group, shape (groups,); ``rows`` (k, n) project out the picks made before."""
+        """Reduction of chi-square of readings y by each group, shape (groups,); ``rows`` (k, n) project out the picks made before.
+
+        Coefficients may have any sign (compare `abbe.models.effects.effect.Effect.one_sign`), so that the reduction is an upper bound.
+        """
         short = rows.astype(np.float32)
         also = np.concatenate([np.zeros((len(rows), 0)), *(short @ part.T for part in self.parts)], axis=1)
         rhs = self.rhs - also.T @ (rows @ y)
@@ -163,9 +167,13 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
     """Gains of groups with equal numbers of columns, rhs^T (gram + prior^-2)^-1 rhs; columns hardly visible after projection add little."""
     k = gram.shape[1]
     eye = np.eye(k)
-    weight = prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30
-    solved = np.linalg.solve(gram + weight[:, :, None] * eye, rhs[:, :, None])[:, :, 0]
+    solved = np.linalg.solve(gram + _ridge(own, prior_sd)[:, :, None] * eye, rhs[:, :, None])[:, :, 0]
     return np.asarray(np.maximum((solved * rhs).sum(axis=1), 0.0))
+
+
+def _ridge(own: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
+    """What is added to the diagonal of a Gram matrix, in the shape of ``own``."""
+    return np.asarray(prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30)
 
 
 def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
@@ -248,8 +256,17 @@ def _gain(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
     coordinates, also = projection.coordinates(columns), rows @ columns
     gram = columns.T @ columns - coordinates.T @ coordinates - also.T @ also
     rhs = columns.T @ projection.residual - also.T @ (rows @ projection.y)
-    sd = pick.prior_sd(problem, columns.shape[1])
-    return float(_gains(gram[None], rhs[None], np.einsum("nk,nk->k", columns, columns)[None], sd[None])[0])
+    own, sd = np.einsum("nk,nk->k", columns, columns), pick.prior_sd(problem, columns.shape[1])
+    if pick.effect.one_sign:
+        return max(_positive_gain(gram, sign * rhs, own, sd) for sign in (1.0, -1.0))
+    return float(_gains(gram[None], rhs[None], own[None], sd[None])[0])
+
+
+def _positive_gain(gram: F2, rhs: F1, own: F1, prior_sd: F1) -> float:
+    """Gain of one group (`_gains`) whose coefficients may not be negative."""
+    root = np.linalg.cholesky(gram + np.diag(_ridge(own, prior_sd)))
+    whole = np.linalg.solve(root, rhs)
+    return float(whole @ whole - scipy.optimize.nnls(root.T, whole)[1] ** 2)
 
 
 def whitened(problem: WhitenedProblem, pick: Pick) -> tuple[F2, F2]:

@@ -11,7 +11,11 @@ from abbe.models.effects.path import Path
 
 
 def scaled(path: Path, values: Values) -> F2:
-    """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2."""
+    """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2.
+
+    The error is of second order, so it has one sign in all set-ups: a mirror square to the motion always reads long, one square to the beam
+    always short. Only a tilt above half of theta could change it, for which theta^2 is below the noise.
+    """
     return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
 
 
@@ -35,6 +39,7 @@ EFFECT = Effect(
     typical=(1.0, 5.0),
     shape=(),
     signal=per_setup("laser", 1, scaled),
+    one_sign=True,
     strength=strength,
     needs="a ball-bar scale as reference: with a laser alone it is part of the axes' scales",
     signature="a scale error of each diagonal, constant over time and direction of motion",

@@ -76,6 +76,8 @@ def answered(named: NamedEffect) -> dict[str, Any]:
         ("straightness:EYX", "spindle_thermal_drift:Z", 0.022, False),
         ("contour_lag", "servo_mismatch:X", 0.039, True),
         ("contour_lag", "servo_mismatch:X", 0.041, False),
+        ("air_refraction", "laser_cosine", 0.036, True),
+        ("laser_cosine", "air_refraction", 0.036, False),  # a beam is constant in time
         ("servo_mismatch:Y", "servo_mismatch:X", 0.02, False),  # two axes may be off, each by its own delay
         ("vibration:Z", "stick_slip:X", 0.007, False),  # the rule compares with effects of the mean
     ],
