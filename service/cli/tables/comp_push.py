@@ -112,7 +112,6 @@ def rollback(
     from abbe.service.errors import ConfigError
     from abbe.service.verification.verified_by import measure_now
 
-
     async def work(store: Store) -> RollbackResult | str | None:
         last = store.pushes.entries(site.name, site.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
