@@ -54,7 +54,8 @@ TRIED = 8
 LIKE = 0.3
 """Least share of the gain of the names that it would replace at which a rival in its textbook form is refined."""
 KIN = 0.02
-"""Rivals that explain all but this share of the gain are not excluded, because a real effect deviates that much from its formula."""
+"""Rivals that explain all but this share of the gain are not excluded: a real effect deviates that much from its formula, and a name with
+more unknowns may win because it follows the deviations. So this does not hold for rivals with more unknowns than the name has."""
 
 
 def refined(problem: WhitenedProblem, pick: Pick, beside: Taken, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
@@ -412,9 +413,16 @@ def rivals_of(contest: Contest, found: Sequence[Selection], i: int) -> list[Riva
         pick, gain = refined(contest.problem, candidate.pick, beside)
         pick, gain, score = _formed(contest, pick, beside, gain)
         rival = Rival(pick, own.score - score, gain / own.gain)
-        if rival.deficit < EXCLUDED or rival.share > 1.0 - KIN:
+        if rival.deficit < EXCLUDED or (
+            rival.share > 1.0 - KIN and _unknowns(contest.problem, pick) <= _unknowns(contest.problem, own.pick)
+        ):
             out.append(rival)
     return sorted(out, key=lambda r: r.deficit)
+
+
+def _unknowns(problem: WhitenedProblem, pick: Pick) -> int:
+    """Number of coefficients and non-linear parameters of a pick."""
+    return int(pick.raw(problem).shape[1]) + len(pick.effect.shape)
 
 
 def _nested(a: Pick, b: Pick) -> bool:

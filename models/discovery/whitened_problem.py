@@ -76,8 +76,14 @@ class SignalProjection:
         return replace(projection, y_coordinates=projection.coordinates(y[:, None])[:, 0])
 
     def coordinates(self, columns: F2) -> F2:
-        """Apply T of the class to columns (n, q): return T @ columns, shape (p + k, q)."""
-        return np.concatenate([self.root @ ((columns * self.weight[:, None]).T @ self.columns).T, self.more @ columns])
+        """Apply T of the class to columns (n, q): return T @ columns, shape (p + k, q).
+
+        Only the readings from the first to the last that a column changes are multiplied: a step or a burst changes few.
+        """
+        changed = np.flatnonzero(np.any(columns, axis=1))
+        at = slice(int(changed[0]), int(changed[-1]) + 1) if changed.size else slice(0, 0)
+        part = columns[at]
+        return np.concatenate([self.root @ ((part * self.weight[at, None]).T @ self.columns[at]).T, self.more[:, at] @ part])
 
     def spread(self, amounts: F2) -> F2:
         """Apply the transpose of T to amounts (p + k, q): return T^T @ amounts, shape (n, q)."""
