@@ -14,7 +14,7 @@ from typing import Literal
 
 import numpy as np
 
-from abbe.models.arrays import F1, F2
+from abbe.models.arrays import F1, F2, F3
 from abbe.models.solvers.artefact import ArtefactPoints, form_rows
 from abbe.models.solvers.artefact_motion import fine_of, motion_rows, unfollowed_mm2
 from abbe.models.solvers.joint import JointSolution
@@ -81,15 +81,20 @@ def field_shares(joint: JointSolution, rank: PoseRank) -> tuple[Share, ...]:
     at = np.concatenate([stated_places(r.axes_mm, q.matrix, q.nominal_mm, keep) for r, q in probed])
     middle, off = 0.5 * (at.min(axis=0) + at.max(axis=0)), next(k for k in range(3) if k not in keep)
     points = np.insert(at, off, float(np.mean([r.axes_mm[:, off].mean() for r, _ in probed])), axis=1)
-    weights = np.zeros((len(NAMED), len(at), 3))
-    weights[:, :, keep] = _weights((at - middle) / p.reach_mm).reshape(len(NAMED), -1, 2)
-    machine = np.tensordot(weights, motion_rows(joint, run.tool_mm, points, fine_of(joint)), 2)
-    unfollowed = unfollowed_mm2(joint, points, weights)
-    sign = np.array([_turned(name, p.matrix[keep][:, :2]) for name in NAMED])  # as the part lies in the first pose
+    sign = np.array([_turned(name, p.matrix[keep][:, :2]) for name in NAMED])[:, None]  # as the part lies in the first pose
+    of_machine = np.zeros((len(NAMED), len(at), 3))
+    of_machine[:, :, keep] = _weights((at - middle) / p.reach_mm).reshape(len(NAMED), -1, 2)
+    machine = np.tensordot(of_machine, motion_rows(joint, run.tool_mm, points, fine_of(joint)), 2)
+    touched, of_part = np.concatenate([r.axes_mm for r, _ in probed]), _in_the_part([q for _, q in probed], places)
+    of_both = np.concatenate([sign[..., None] * of_part, -of_machine], axis=1)
+    asked = (
+        (sign * form, unfollowed_mm2(joint, touched, of_part)),
+        (machine, unfollowed_mm2(joint, points, of_machine)),
+        (sign * form - machine, unfollowed_mm2(joint, np.concatenate([touched, points]), of_both)),
+    )
     out = []
     for i, name in enumerate(NAMED):
-        asked = ((sign[i] * form[i], 0.0), (machine[i], unfollowed[i]), (sign[i] * form[i] - machine[i], unfollowed[i]))
-        (part, u_part, part_nats), (own, u_own, own_nats), (sum_, u_sum, nats) = (_known(joint, *one) for one in asked)
+        (part, u_part, part_nats), (own, u_own, own_nats), (sum_, u_sum, nats) = (_known(joint, w[i], v[i]) for w, v in asked)
         seen = [n > NATS and abs(v) > LEAST_MM for n, v in ((part_nats, part), (own_nats, own), (nats, sum_))]
         verdict = _verdict(seen, hidden=name in rank.hidden)
         out.append(Share(name, part, u_part, part_nats, own, u_own, own_nats, sum_, u_sum, verdict, p.reach_mm))
@@ -127,6 +132,21 @@ def _weights(q: F2) -> F2:
     rigid = [np.tile([1.0, 0.0], (len(q), 1)), np.tile([0.0, 1.0], (len(q), 1)), np.stack([-q[:, 1], q[:, 0]], axis=1)]
     basis = np.stack([*rigid, *(field(q) for field in NAMED.values())], axis=2).reshape(2 * len(q), -1)
     return np.asarray(np.linalg.pinv(basis)[3:])
+
+
+def _in_the_part(probed: list[ArtefactPoints], places: dict[str, F1]) -> F3:
+    """Return weights by which the machine's deviations at all readings enter the part's amounts, shape (5, readings, 3).
+
+    What the solution does not follow of them counts as form: the place of a feature is the mean of its readings.
+    """
+    p, order = probed[0], {f: i for i, f in enumerate(places)}
+    weights = np.zeros((len(NAMED), len(places), 3))
+    weights[:, :, :2] = _weights((np.array(list(places.values())) - p.middle_mm)[:, :2] / p.reach_mm).reshape(len(NAMED), -1, 2)
+    feature, component = np.array([order[f] for q in probed for f in q.feature]), np.concatenate([q.component for q in probed])
+    count = np.zeros((len(places), 3))
+    np.add.at(count, (feature, component), 1.0)
+    way = np.concatenate([q.matrix.T[q.component] for q in probed])
+    return np.asarray((weights[:, feature, component] / count[feature, component])[..., None] * way)
 
 
 def form_amounts(p: ArtefactPoints, places: dict[str, F1], names: tuple[str, ...]) -> F2:

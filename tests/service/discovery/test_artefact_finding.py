@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from abbe.models.solvers.artefact_shares import _verdict
+from abbe.models.solvers.artefact_shares import _in_the_part, _verdict
 from abbe.models.solvers.observability.poses import NAMED, stated_places
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.cli.app import app
@@ -60,6 +60,20 @@ def test_the_amounts_of_a_machine_with_screw_errors_lie_within_their_uncertainty
         z += [(s.part_mm - p) / s.u_part_mm for s, p in zip(found.shares, part, strict=True)]
     assert np.abs(z).max() < 3.0
     assert np.sqrt(np.mean(np.square(z))) < 1.3
+
+
+def test_what_the_solution_does_not_follow_of_the_machine_counts_as_form_of_the_part(tmp_path: Path) -> None:
+    """A deviation of each reading shifts its feature by a quarter: four poses touch it once each."""
+    probed = [r.points for r in artefact_finding(from_folder(campaign(tmp_path))).solved.joint.data if r.points.source == "probe"]
+    places = {f: n for p in probed for f, n in zip(p.feature, p.nominal_mm, strict=True)}
+    moved = np.random.default_rng(3).standard_normal((sum(len(p.feature) for p in probed), 3))
+    shift, start = {f: np.zeros(3) for f in places}, 0
+    for p in probed:
+        for feature, component, d in zip(p.feature, p.component, moved[start:], strict=False):
+            shift[feature][component] += d @ p.matrix[:, component] / len(probed)
+        start += len(p.feature)
+    part = amounts((nominal() - 111.0) / REACH_MM, np.array([shift[f][:2] for f in places]))
+    assert np.einsum("frc,rc->f", _in_the_part(probed, places), moved) == pytest.approx(part)
 
 
 def test_what_only_the_reading_shows_is_unknown_and_not_none():
