@@ -44,7 +44,8 @@ class Fine:
     """Fine structure of one axis' motion that no polynomial follows: one unknown, mm, in direction ``component``.
 
     With ``period_mm`` above 0 it is a wave over the position: cosine (``phase`` 0) or sine (1). Otherwise it is one displacement of all
-    points within `SAME_PLACE_MM` of ``at_mm``. ``size_mm``: prior standard deviation; 0: the default.
+    points within `SAME_PLACE_MM` of ``at_mm``. Waves of one period stand in for it beside others: ``found_mm`` is the period that they
+    share, ``probability`` that of this period.
     """
 
     axis: int
@@ -52,7 +53,8 @@ class Fine:
     at_mm: float = 0.0
     period_mm: float = 0.0
     phase: int = 0
-    size_mm: float = 0.0
+    found_mm: float = 0.0
+    probability: float = 1.0
 
     @property
     def name(self) -> str:
@@ -60,6 +62,10 @@ class Fine:
         where = f"{self.period_mm:.5g}" if self.period_mm else f"{self.at_mm:.2f}"
         end = f"_{self.phase}" if self.period_mm else ""
         return f"{'wave' if self.period_mm else 'nugget'}_{'XYZ'[self.axis]}_{where}_{LETTERS[self.component]}{end}"
+
+    def sd_mm(self, priors: ArtefactPriors) -> float:
+        """Prior standard deviation; the two waves of a period share its variance."""
+        return priors.wave_mm * float(np.sqrt(0.5 * self.probability)) if self.period_mm else priors.nugget_mm
 
     def values(self, axes_mm: F2) -> F1:
         """Motion per unit at axis positions (n, 3)."""
@@ -198,7 +204,7 @@ def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPrior
     out |= _steps(p, setup)
     if p.source == "probe":
         out |= {name: priors.warp_mm if name.startswith("warp_") else priors.clamp_mm for name in _bends(p, setup)}
-    out |= {one.name: one.size_mm or priors.nugget_mm for one in p.fine}
+    out |= {one.name: one.sd_mm(priors) for one in p.fine}
     if p.normal.any():
         out[f"stylus_{p.source}"] = priors.stylus_mm
     out |= {name: priors.lobing_mm for name, _ in lobing(p)} if p.source == "probe" else {}

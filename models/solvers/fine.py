@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.artefact import PRIORS, SAME_PLACE_MM, Fine
+from abbe.models.solvers.artefact import SAME_PLACE_MM, Fine
 from abbe.models.solvers.components import KINDS
 from abbe.models.solvers.engine import CampaignFit, CampaignProblem
 from abbe.models.solvers.observations import RunData
@@ -128,18 +128,19 @@ def _columns(runs: tuple[RunData, ...], fine: tuple[Fine, ...]) -> F2:
 
 
 def _waves(peaks: tuple[Peak, ...]) -> tuple[Fine, ...]:
-    """Waves of probable periods, sized by their probability.
+    """Waves of probable periods, sized by their probability: cosine and sine of the positioning of each axis.
 
     Two waves, at the ends of the standard uncertainty of a period, stand for each period, so that the solution can shift it.
     """
-    out = []
-    for p in peaks:
-        size = PRIORS.wave_mm * (0.5 * p.weight) ** 0.5
-        for frequency in (p.frequency - p.u_frequency, p.frequency + p.u_frequency):
-            out += [replace(w, size_mm=size) for a in p.axes for w in wave_pair(a, 1.0 / frequency)]
-    return tuple(out)
+    return tuple(
+        Fine(a, a, period_mm=1.0 / frequency, phase=phase, found_mm=1.0 / p.frequency, probability=p.weight)
+        for p in peaks
+        for frequency in (p.frequency - p.u_frequency, p.frequency + p.u_frequency)
+        for a in p.axes
+        for phase in (0, 1)
+    )
 
 
-def wave_pair(axis: int, period_mm: float) -> tuple[Fine, Fine]:
-    """Cosine and sine of the positioning of an axis."""
-    return Fine(axis, axis, period_mm=period_mm, phase=0), Fine(axis, axis, period_mm=period_mm, phase=1)
+def sure_periods(fine: tuple[Fine, ...]) -> tuple[tuple[int, float], ...]:
+    """Axes and periods, mm, that no other explanation rivals: of at least the probability `SURE`; each once."""
+    return tuple(dict.fromkeys((one.axis, one.found_mm) for one in fine if one.period_mm and one.probability >= SURE))

@@ -8,6 +8,7 @@ from typing import Any
 from abbe.models.solvers.artefact_motion import fine_of
 from abbe.models.solvers.artefact_shares import Share, field_shares
 from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
+from abbe.models.solvers.fine import sure_periods
 from abbe.models.solvers.observability.poses import PoseRank, pose_rank
 from abbe.service.campaign_data.campaign_folder import Campaign
 from abbe.service.identification.artefact_answer import artefact_lines
@@ -21,7 +22,7 @@ LEFT = 2.0
 @dataclass(frozen=True, eq=False)
 class ArtefactFinding:
     """``shares``: shares of part and machine in the named fields, empty unless one plate lay in several poses in a plane (``rank``).
-    ``waves``: periods of the machine's motions. ``scatter``: scatter of the points as a multiple of their repeatability."""
+    ``waves``: periods of the machine's motions that are sure. ``scatter``: scatter of the points as a multiple of their repeatability."""
 
     campaign: str
     solved: Solved
@@ -58,7 +59,7 @@ def artefact_finding(campaign: Campaign) -> ArtefactFinding:
     """Solve the campaign and separate part and machine. Raises as `solve_runs`."""
     solved = solve_runs(campaign.site, campaign.runs, instruments=campaign.doc.get("instruments"))
     joint, rank = solved.joint, pose_rank(solved.joint.data)
-    waves = dict.fromkeys(f"a wave of {w.period_mm:.4g} mm along {'XYZ'[w.axis]}" for w in fine_of(joint) if w.period_mm)
+    waves = dict.fromkeys(f"a wave of {period_mm:.4g} mm along {'XYZ'[axis]}" for axis, period_mm in sure_periods(fine_of(joint)))
     scatter = joint.noise_mm["artefact"] / DEFAULT_SIGMA_MM["artefact"]
     return ArtefactFinding(campaign.name, solved, rank, () if rank is None else field_shares(joint, rank), tuple(waves), scatter)
 

@@ -5,8 +5,9 @@ import os
 import numpy as np
 import pytest
 
-from abbe.models.solvers.fine import SURE
-from abbe.models.solvers.waves import Displacements, gain_of_pairs, peaks
+from abbe.models.solvers.artefact import PRIORS
+from abbe.models.solvers.fine import SURE, _waves, sure_periods
+from abbe.models.solvers.waves import Displacements, Peak, gain_of_pairs, peaks
 
 PITCH_MM = 56.8
 SIGMA_MM = 3e-4
@@ -76,3 +77,12 @@ def test_one_period_beside_scatter(seed: int) -> None:
     found = [p for p in peaks(touched({10.0: 2.5}, seed, scatter_um=0.5)) if p.weight > 0.5]
     assert len(found) == 1
     assert 1.0 / found[0].frequency == pytest.approx(10.0, abs=0.1)
+
+
+def test_only_a_period_without_rivals_is_named_and_only_once() -> None:
+    """Every probable period has waves in the model; two waves stand for one period."""
+    fine = _waves((Peak((0, 1), 0.1, 1e-4, 0.95), Peak((0,), 0.04, 1e-4, 0.6), Peak((1,), 0.13, 1e-4, 0.3)))
+    assert {one.found_mm for one in fine} == {1.0 / 0.1, 1.0 / 0.04, 1.0 / 0.13}
+    assert sure_periods(fine) == ((0, 10.0), (1, 10.0))
+    variance = sum(one.sd_mm(PRIORS) ** 2 for one in fine if one.axis == 1 and one.phase == 0 and one.found_mm < 9.0)
+    assert variance == pytest.approx(0.3 * PRIORS.wave_mm**2)

@@ -51,13 +51,16 @@ def test_the_amounts_of_part_and_machine_are_those_that_were_put_in(tmp_path: Pa
     assert "squareness" in found.verdict
 
 
-def test_the_amounts_of_a_machine_with_screw_errors_lie_within_their_uncertainty(tmp_path: Path) -> None:
+def test_the_amounts_of_a_machine_with_screw_errors_lie_within_their_uncertainty_and_only_its_leads_are_named(tmp_path: Path) -> None:
     z = []
     for seed in (1, 2):
         (tmp_path / str(seed)).mkdir()
         found, part, machine = found_and_true(tmp_path / str(seed), seed, screws_mm)
         z += [(s.machine_mm - m) / s.u_machine_mm for s, m in zip(found.shares, machine, strict=True)]
         z += [(s.part_mm - p) / s.u_part_mm for s, p in zip(found.shares, part, strict=True)]
+        named = [float(wave.split()[3]) for wave in found.waves]
+        assert any(abs(period - 10.0) < 0.05 for period in named)
+        assert all(min(abs(period - 10.0), abs(period - 40.0 / 3.0)) < 0.1 for period in named), named
     assert np.abs(z).max() < 3.0
     assert np.sqrt(np.mean(np.square(z))) < 1.3
 
