@@ -8,8 +8,8 @@ parameters that the data cannot separate. The noise of the instruments and the s
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import wraps
 from typing import Concatenate, Literal, ParamSpec, TypeVar
 from weakref import WeakKeyDictionary
@@ -40,6 +40,7 @@ from abbe.models.solvers.observe import SetupUnknowns
 from abbe.models.solvers.order_choice import RIGID6, OrderChoice, choose, regions, term_levels
 from abbe.models.solvers.priors import Priors
 from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
+from abbe.models.solvers.scale_drift import ScaleDrift, drift_factor, scale_drifts
 
 ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, -1.0
 """The solution includes the motions' rough parts if the score for these parts exceeds its expectation by this many standard deviations;
@@ -93,8 +94,10 @@ class JointSolution:
     order_choice : scores of all orders on left-out set-ups (model "auto": also on regions); None if the caller chose the order.
     size_factors : dict
         Ratio of estimated to documented typical size for each class of unknowns; ``length``: correlation length, strokes.
-    table_factor : array, shape (p, k), or None
-        Factor of the part of the covariance of ``estimate`` that comes from an unknown table active during the runs; None: there was none.
+    added : dict of array, shape (p, k)
+        Factors of parts of the covariance of ``estimate`` that no reading shows, by source: ``table``, an unknown table active during the
+        runs; ``scale_drift``, scales that changed meanwhile (`abbe.models.solvers.scale_drift`).
+    scale_drifts : clear changes of scales during the campaign.
     """
 
     machine: Machine
@@ -117,7 +120,8 @@ class JointSolution:
     model: str
     order_choice: OrderChoice | None
     size_factors: dict[str, float]
-    table_factor: F2 | None = None
+    added: Mapping[str, F2] = field(default_factory=dict)
+    scale_drifts: tuple[ScaleDrift, ...] = ()
 
     @property
     def has_artefacts(self) -> bool:
@@ -169,6 +173,18 @@ def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatena
         return mine[key]
 
     return asked
+
+
+def widened(solution: JointSolution, source: str, factor: F2) -> JointSolution:
+    """Return the same solution with one more part of its covariance, factor factor^T (`JointSolution.added`), shape (p, k).
+
+    No unknown gets less sure than its prior.
+    """
+    left = np.maximum(solution.prior_sd**2 - solution.estimate.covariance.diagonal(), 0.0)
+    size = np.sum(factor**2, axis=1)
+    factor = factor * np.sqrt(np.divide(left, size, out=np.ones_like(size), where=size > left))[:, None]
+    wider = replace(solution.estimate, covariance=solution.estimate.covariance + factor @ factor.T)
+    return replace(solution, estimate=wider, added={**solution.added, source: factor})
 
 
 def implausible(solution: JointSolution, prior_sd: dict[str, float], limit: float = 5.0) -> list[tuple[str, float]]:
@@ -267,7 +283,8 @@ def _solution(problem: CampaignProblem, fit: CampaignFit, model: str, order: int
     whole, c = total(fit.parts), fit.components
     information = np.tensordot(np.exp(-c.eta), whole.gram, 1) / np.outer(fit.sizes.typical, fit.sizes.typical)
     factor = np.exp(0.5 * c.eta)
-    return JointSolution(
+    drifts = scale_drifts(problem, fit)
+    solution = JointSolution(
         machine=problem.machine,
         terms=problem.terms,
         estimate=_estimate(problem, fit),
@@ -288,7 +305,9 @@ def _solution(problem: CampaignProblem, fit: CampaignFit, model: str, order: int
         model=model,
         order_choice=choice,
         size_factors={n: float(np.exp(0.5 * v)) for n, v in zip(fit.sizes.names, c.psi, strict=True)} | {"length": fit.sizes.length},
+        scale_drifts=drifts,
     )
+    return widened(solution, "scale_drift", drift_factor(problem, drifts)) if drifts else solution
 
 
 def _estimate(problem: CampaignProblem, fit: CampaignFit) -> ParameterEstimate:

@@ -151,8 +151,8 @@ def response(solution: JointSolution) -> Response:
     pull = scipy.linalg.cho_solve((low, True), root.T).T  # C R^-T
     covariance = inner.T @ inner
     widening = solution.estimate.covariance - covariance
-    if solution.table_factor is not None:
-        widening = widening - solution.table_factor @ solution.table_factor.T
+    for factor in solution.added.values():
+        widening = widening - factor @ factor.T
     return Response(design, solution.weight_per_mm2, kind, covariance, pull, widening, solution.estimate.dof)
 
 
@@ -246,6 +246,7 @@ SOURCE_TEXTS = {
     "setup": "set-up: cup, mirror, zero, drift, pose, form of the artefact, where the data leave them open",
     "scale_temperature": "temperature of the scales (assumed)",
     "model_order": "error motions of orders above the chosen one",
+    "scale_drift": "scales that changed during the campaign",
     "table": "an unknown table that was in force (assumed of usual size)",
     "prior": "typical size of errors, where the data leave them open (assumed)",
     "estimated_sizes": "noise and typical sizes are themselves estimated",
@@ -340,8 +341,7 @@ def _sources(solution: JointSolution, inputs: StatedInputs) -> tuple[tuple[Term,
     r = response(solution)
     n = len(solution.terms)
     found = [*_noise(r, inputs), *_priors(solution, r), *_calibration(solution, r, inputs), *_temperature(solution, inputs)]
-    if solution.table_factor is not None:
-        found.append(Source("table", solution.table_factor))
+    found += [Source(name, factor) for name, factor in solution.added.items()]
     if inputs.single_approach:
         found.append(Source("repeatability", np.zeros((n, 0)), inputs.repeatability_dof, inputs.repeatability_mm))
     terms, extra = order_source(solution, inputs.orders_above)

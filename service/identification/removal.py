@@ -20,7 +20,7 @@ from abbe.models.compensation.tables import NineTables, grid_positions, smooth_o
 from abbe.models.effects.effect import Effect
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.solvers.applied_tables import AppliedTables
-from abbe.models.solvers.joint import JointSolution, solve_joint
+from abbe.models.solvers.joint import JointSolution, solve_joint, widened
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.priors import Priors, term_prior_sd
 from abbe.models.uncertainty.sources import response
@@ -164,15 +164,10 @@ points, unit of their entries; and the seed."""
 
 
 def with_unknown_table(solution: JointSolution) -> JointSolution:
-    """Return the same solution; its covariance includes an unknown table in force (`JointSolution.table_factor`)."""
+    """Return the same solution; its covariance includes an unknown table in force."""
     r = response(solution)
     effect = r.design.T @ (r.weight[:, None] * reading_patterns_mm(solution))
-    factor = r.covariance @ effect / np.sqrt(TABLES)
-    left = np.maximum(solution.prior_sd**2 - solution.estimate.covariance.diagonal(), 0.0)
-    size = np.sum(factor**2, axis=1)
-    factor *= np.sqrt(np.divide(left, size, out=np.ones_like(size), where=size > left))[:, None]  # no unknown is less sure than its prior
-    wider = replace(solution.estimate, covariance=solution.estimate.covariance + factor @ factor.T)
-    return replace(solution, estimate=wider, table_factor=factor)
+    return widened(solution, "table", r.covariance @ effect / np.sqrt(TABLES))
 
 
 def reading_patterns_mm(solution: JointSolution) -> F2:

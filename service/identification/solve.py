@@ -132,7 +132,7 @@ def solve_runs(
     ):
         flags.append(beyond)
         joint = solve_joint(site.machine, points, model="rigid6", priors=priors, progress=progress) if free else joint
-    flags += check_instruments(joint, points)
+    flags += check_instruments(joint, points) + changing_scales(joint)
     flags += [CampaignIssue(f.run, f.what, f.done, False) for f in (*faults, *(seen(joint) if touched else ()))]
     spatial = {r.run_id for r in used if r.test == "ballbar_helix"}  # a circle does not determine ten parameters
     helices = {run.label: fit_run(run, sigma_mm=max(noise, 1e-4)) for run in data if run.label in spatial}
@@ -264,6 +264,16 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
             "check the laser's air compensation, the bar's length, the cup and the mirror before measuring again; nothing was written",
         )
     return [_unusual(name, times, data) for name, times in found]
+
+
+def changing_scales(joint: JointSolution) -> list[CampaignIssue]:
+    """Return a flag for each scale that changed during the campaign, as of a ball screw that warms up."""
+    first = min(joint.data, key=lambda run: run.t_s[0]).label
+    issues = []
+    for one in joint.scale_drifts:
+        change = f"the scale of {'XYZ'[one.axis]} changed by {1e6 * one.change:+.1f} ± {2e6 * one.u:.1f} µm/m during the campaign"
+        issues.append(CampaignIssue(first, f"{change}: U includes it", "let the machine warm up, then measure again", False))
+    return issues
 
 
 def _unusual(name: str, times: float, data: tuple[RunData, ...]) -> CampaignIssue:

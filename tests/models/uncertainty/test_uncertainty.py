@@ -150,7 +150,7 @@ def test_repeatability_takes_its_share_out_of_the_readings_and_adds_to_a_single_
 def test_every_source_has_words_and_degrees_of_freedom(solution):
     inputs = StatedInputs(repeatability_mm=1e-4, repeatability_dof=9.0)
     sources = error_sources(solution, inputs)
-    assert {s.name for s in sources.sources} == set(SOURCE_TEXTS) - {"table", "artefact_noise"}  # neither acted here
+    assert {s.name for s in sources.sources} == set(SOURCE_TEXTS) - {"table", "scale_drift", "artefact_noise"}  # none acted here
     assert sources.source("repeatability").dof == 9.0
     assert sources.source("scale_temperature").dof == np.inf
     assert sources.source("estimated_sizes").dof == np.inf  # it is the allowance for few degrees of freedom itself

@@ -1,0 +1,67 @@
+"""A scale that changes while the machine is measured: stated with its size, and the scale is known no better than that."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from abbe.models.solvers.joint import solve_joint
+from abbe.models.solvers.observations import RunData
+from abbe.models.uncertainty.inputs import StatedInputs
+from abbe.models.uncertainty.sources import error_sources
+from tests.models.solvers.truth import MACHINE, Truth
+
+WARM, SETTLES_S, BETWEEN_S = 12e-6, 2500.0, 400.0
+"""Growth of a warm screw, its time constant, and the time from one run to the next."""
+
+
+def one_after_another(runs: tuple[RunData, ...], first_s: float = 600.0) -> tuple[RunData, ...]:
+    return tuple(replace(run, t_s=run.t_s + first_s + BETWEEN_S * k) for k, run in enumerate(runs))
+
+
+def warming(run: RunData, axis: int, growth: float) -> RunData:
+    """The run on a machine that was cold at 0 s; the cup and the laser's zero see the screw as it is when they are set."""
+    grown = growth * (1.0 - np.exp(-run.t_s / SETTLES_S)) * run.axes_mm[:, axis]
+    if run.centre_mm is None:
+        return replace(run, deviation_mm=run.deviation_mm + run.beam[axis] * (grown - grown[0]))
+    at_cup = growth * (1.0 - np.exp(-run.t_s[0] / SETTLES_S)) * run.centre_mm[axis]
+    bar = run.axes_mm - run.centre_mm
+    return replace(run, deviation_mm=run.deviation_mm + bar[:, axis] / np.linalg.norm(bar, axis=1) * (grown - at_cup))
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_screw_that_warms_up_is_stated_and_its_scale_is_known_cold_and_warm(axis):
+    truth = Truth(11 + axis)
+    solution = solve_joint(MACHINE, tuple(warming(run, axis, WARM) for run in one_after_another(truth.campaign())))
+    (drift,) = solution.scale_drifts
+    assert drift.axis == axis
+    assert abs(drift.change - WARM) < 3.0 * drift.u < 0.7 * WARM
+    name = ("EXX.1", "EYY.1", "EZZ.1")[axis]
+    place = solution.estimate.names.index(name)
+    scale, u = solution.estimate.theta[place], np.sqrt(solution.estimate.covariance[place, place])
+    half = MACHINE.length_mm[axis] / 2.0
+    still = solve_joint(MACHINE, one_after_another(truth.campaign()))
+    cold = still.estimate.theta[place]
+    for state in (cold, cold + WARM * half):
+        assert abs(scale - state) < 2.5 * u, "the growth is no straight line in time"
+    assert u > 2.0 * np.sqrt(still.estimate.covariance[place, place]), "noise alone would promise more"
+
+
+def test_the_sources_of_uncertainty_name_it_and_add_up():
+    solution = solve_joint(MACHINE, tuple(warming(run, 0, WARM) for run in one_after_another(Truth(11).campaign())))
+    found = error_sources(solution, StatedInputs().without_stated_inputs())
+    assert "scale_drift" in {one.name for one in found.sources}
+    parts = sum(one.factor @ one.factor.T for one in found.sources) - sum(
+        one.subtracted @ one.subtracted.T for one in found.sources if one.subtracted is not None
+    )
+    np.testing.assert_allclose(parts, solution.term_covariance, rtol=1e-6, atol=1e-14)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_machine_that_stays_as_it_is_has_none(seed):
+    assert solve_joint(MACHINE, one_after_another(Truth(seed).campaign())).scale_drifts == ()
+
+
+def test_no_scale_is_less_sure_than_its_prior():
+    solution = solve_joint(MACHINE, tuple(warming(run, 0, 100 * WARM) for run in one_after_another(Truth(11).campaign())))
+    assert (solution.estimate.covariance.diagonal() <= solution.prior_sd**2 * (1.0 + 1e-9)).all()
