@@ -44,8 +44,8 @@ class Fine:
     """Fine structure of one axis' motion that no polynomial follows: one unknown, mm, in direction ``component``.
 
     With ``period_mm`` above 0 it is a wave over the position: cosine (``phase`` 0) or sine (1). Otherwise it is one displacement of all
-    points within `SAME_PLACE_MM` of ``at_mm``. Waves of one period stand in for it beside others: ``found_mm`` is the period that they
-    share, ``probability`` that of this period.
+    points within `SAME_PLACE_MM` of ``at_mm``. Several waves stand for one found period, ``found_mm``; ``probability``: that this period is
+    real.
     """
 
     axis: int

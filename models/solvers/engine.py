@@ -337,32 +337,15 @@ def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term
     """
     sizes = size_model(problem.machine, terms, (), np.zeros(0), Priors())
     columns = np.concatenate([run_design(problem.machine, terms, r, problem.setup)[:, : len(terms)] for r in problem.runs])
-    asked, information, _ = score(problem, fit, columns * sizes.typical @ sizes.root)
-    return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
-
-
-def score(problem: CampaignProblem, fit: CampaignFit, columns: F2) -> tuple[F1, F2, F2]:
-    """Score of further unknowns that the fit takes as zero, and its information without what the fit's own unknowns explain.
-
-    Parameters
-    ----------
-    columns : array, shape (readings, k)
-        Change of every reading per unit of each further unknown, mm.
-
-    Returns
-    -------
-    tuple of array, shape (k,), array, shape (k, k), and array, shape (p, k)
-        Derivative of the log likelihood; its covariance; how much a unit of each further unknown moves the fit's unknowns.
-    """
     kind = problem.readings.kind
     weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
-    b = columns / problem.sigma[:, None]
+    b = columns * sizes.typical / problem.sigma[:, None]
     weighted = b * weight[:, None]
     root = fit.sizes.root * fit.components.half(fit.sizes)
-    across = (weighted.T @ problem.readings.a) @ root
-    moved = fit.posterior.cov @ across.T
-    asked = weighted.T @ (fit.residual_mm / problem.sigma)
-    return asked, b.T @ weighted - across @ moved, fit.sizes.typical[:, None] * (root @ moved)
+    across = sizes.root.T @ (weighted.T @ problem.readings.a) @ root
+    information = sizes.root.T @ (b.T @ weighted) @ sizes.root - across @ fit.posterior.cov @ across.T
+    asked = sizes.root.T @ (weighted.T @ (fit.residual_mm / problem.sigma))
+    return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
 
 
 def _thinning(problem: CampaignProblem, size: F1, weight: F1) -> F1:

@@ -97,7 +97,7 @@ class JointSolution:
     added : dict of array, shape (p, k)
         Factors of parts of the covariance of ``estimate`` that no reading shows, by source: ``table``, an unknown table active during the
         runs; ``scale_drift``, scales that changed meanwhile (`abbe.models.solvers.scale_drift`).
-    scale_drifts : clear changes of scales during the campaign.
+    scale_drifts : the clear change of a scale during the campaign, if there is one.
     """
 
     machine: Machine

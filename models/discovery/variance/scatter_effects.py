@@ -342,9 +342,10 @@ def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple
             continue
         smooth = [(roughness_of(r), w) for r, w in runs]
         louder = [float(np.mean(q[w])) > ROUGHER * float(np.mean(q[~w])) for q, w in smooth]
-        gains = (_two_levels(smooth)[0] / ALIKE, _two_levels([(r**2, w) for r, w in runs])[0])
-        if np.mean(louder) >= IN_RUNS and (best is None or min(gains) > best[0]):
-            best = (min(gains), _two_levels(smooth)[1], key, there)
+        alike, times = _two_levels(smooth)
+        gain = min(alike / ALIKE, _two_levels([(r**2, w) for r, w in runs])[0])
+        if gain > 0.0 and np.mean(louder) >= IN_RUNS and (best is None or gain > best[0]):
+            best = (gain, times, key, there)
     if best is None:
         return []
     gain, times, key, there = best

@@ -13,8 +13,8 @@ from abbe.models.effects.path import Path
 def scaled(path: Path, values: Values) -> F2:
     """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2.
 
-    The error is of second order, so it has one sign in all set-ups: a mirror square to the motion always reads long, one square to the beam
-    always short. Only a tilt above half of theta could change it, for which theta^2 is below the noise.
+    The error is of second order. It has one sign in all set-ups if all mirrors are aligned the same way: square to the motion the laser
+    always reads long, square to the beam always short.
     """
     return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
 
