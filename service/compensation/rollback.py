@@ -167,7 +167,9 @@ def table_after(journal: JournalView, push: int) -> KnownTable:
     journals = journal.pushes
     if push == 0 and journals:
         return _base(next(iter(journals.values())), "the table that was in force before the first push")
-    return _left(journal.named(push))
+    if push not in journals:
+        raise TableRefused(f"there is no push {push} of this machine", "abbe comp show lists what was pushed; nothing was written")
+    return _left(journals[push])
 
 
 def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:

@@ -162,12 +162,6 @@ class JournalView:
     def _of(self, push: int) -> Journal:
         return tuple(e for e in self.entries if e.push == push)
 
-    def named(self, push: int) -> Journal:
-        """The journal of a push that a person named. Raises TableRefused if there is none."""
-        if push not in self.pushes:
-            raise TableRefused(f"there is no push {push} of this machine", f"abbe comp show lists what was pushed; {NOTHING}")
-        return self.pushes[push]
-
     def facts(self, push: int) -> PushFacts:
         """Facts recorded about a push."""
         return facts(self._of(push))

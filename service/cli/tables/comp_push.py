@@ -37,19 +37,15 @@ def push(
     as_json: JsonOption = False,
 ) -> None:
     """Push a proposal, test the signs of its tables, measure again; roll back if the machine is not better (exit code 1)."""
-    from abbe.service.config import load_machine
-    from abbe.service.storage.store import Store
-
-    loaded = load_machine(machine_file(machine))
-    with Store.open(loaded.database_url) as store:
-        store.proposals.get(proposal)
-
     from abbe.service.cli.running import display, rollback_when_safe, run_job
     from abbe.service.compensation.correct import push as work_push
     from abbe.service.compensation.gate import PushContext, admit
+    from abbe.service.config import load_machine
     from abbe.service.errors import TableRefused
     from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
 
+    loaded = load_machine(machine_file(machine))
     site = site_of(loaded.machine)
     poses = checking_poses(site, check)
     hints: list[str] = []
@@ -91,26 +87,21 @@ def rollback(
     as_json: JsonOption = False,
 ) -> None:
     """Restore the table that was in force before the last kept push: on a person's order, without measuring. Asks first."""
-    from abbe.service.config import load_machine
-    from abbe.service.site import site_of
-    from abbe.service.storage.store import Store
-    from abbe.service.tables.push_journal import JournalView
-
-    loaded = load_machine(machine_file(machine))
-    site = site_of(loaded.machine)
-    if to:
-        with Store.open(loaded.database_url) as store:
-            JournalView.read(store, site.name, site.control, origins=False).named(to)
-
     from dataclasses import replace
 
     from abbe.service.cli.running import run_job
     from abbe.service.compensation.rollback import RollbackResult
     from abbe.service.compensation.rollback import rollback as work_rollback
+    from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
     from abbe.service.domain.push_entry import TERMINAL
     from abbe.service.errors import ConfigError
+    from abbe.service.site import site_of
+    from abbe.service.storage.store import Store
     from abbe.service.verification.verified_by import measure_now
+
+    loaded = load_machine(machine_file(machine))
+    site = site_of(loaded.machine)
 
     async def work(store: Store) -> RollbackResult | str | None:
         last = store.pushes.entries(site.name, site.control)[-1:]
