@@ -21,7 +21,6 @@ FORM = 0.3
 SCALES = ("EXX.1", "EYY.1", "EZZ.1")
 SETTLING = (0.15, 0.4, 1.0)
 """Time constants of the courses that are tried beside a straight line, in durations of the campaign."""
-Courses = tuple[F1, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -68,7 +67,7 @@ def drift_factor(problem: CampaignProblem, drifts: tuple[ScaleDrift, ...]) -> F2
     return factor
 
 
-def _courses(problem: CampaignProblem) -> Courses:
+def _courses(problem: CampaignProblem) -> tuple[F1, ...]:
     """Courses from 0 at the first to 1 at the last reading, less their mean: a straight line, and what settles."""
     t_s = np.concatenate([run.t_s for run in problem.runs])
     span_s = float(np.ptp(t_s))
@@ -87,5 +86,5 @@ def _columns(problem: CampaignProblem) -> tuple[list[str], F2]:
     found["bar"] = radius
     if "laser_scale" in problem.names:
         found["laser"] = rows[:, problem.names.index("laser_scale")]
-    seen = {n: c for n, c in found.items() if np.any(c) and c.size == len(r.kind)}
+    seen = {n: c for n, c in found.items() if np.any(c)}
     return list(seen), np.stack(list(seen.values()), axis=1) if seen else np.zeros((len(r.kind), 0))

@@ -15,9 +15,9 @@ SEEDS = 6 if os.environ.get("ABBE_TEST_LONG") == "1" else 3
 
 
 def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0, *, form: bool = False) -> Displacements:
-    """Displacements at six features a pitch apart in four poses on X and Y, less a straight line that nobody knows.
+    """Displacements at six features a pitch apart in four poses on X and Y; a straight line in them is unknown.
 
-    ``form``: nor are the places of the features; the poses are 0, 90, 180 and 270 degrees, so X and Y read the same features.
+    ``form``: the places of the features are unknown, too; the poses are 0, 90, 180 and 270 degrees, so X and Y read the same features.
     """
     rng = np.random.default_rng(seed)
     place = np.concatenate([start + PITCH_MM * np.arange(6) for start in (103.1, 131.7, 74.9, 166.3)])
