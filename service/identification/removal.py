@@ -157,7 +157,7 @@ def _added_mm(run: Run, axes_mm: F2, force: AppliedTables) -> F1:
 
 
 TABLES = 16
-"""Number of drawn tables; their effect has about this many degrees of freedom."""
+"""Number of tables drawn at random; their effect has about this many degrees of freedom."""
 ORDER, NODES, SPACING_MM, UNIT_MM, SEED = 6, 5, 25.0, 1e-4, 16
 """Properties of the drawn tables: highest Legendre order of the errors that they correct, nodes per axis of their fit, distance of their
 points, unit of their entries; and the seed."""
@@ -209,9 +209,8 @@ class RemovedEffects:
     """A campaign without the effects that tables cannot correct.
 
     ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
-    used; ``version``: version of the book, None without a book; ``in_force``: the active table whose side effects were subtracted
-    (`abbe.service.identification.removal.remove_table`), None without one; ``not_removed``: why the side effects of a table remain
-    in the readings, which the assessment of a solution needs, empty otherwise.
+    used; ``version``: version of the model book, None without one; ``in_force``: the active table whose side effects were subtracted
+    (`remove_table`), None without one; ``not_removed``: why the side effects of a table remain in the readings, empty if none remain.
     """
 
     campaign: Campaign
@@ -236,8 +235,8 @@ def remove_effects(
 ) -> RemovedEffects:
     """Subtract effects that tables cannot correct from a campaign's readings.
 
-    These are the effect beyond smooth corrections of ``table``, which was active during the measurement, and those effects of the machine's
-    current model that apply to this campaign and have another remedy. Without a ``store`` there is no such model.
+    Of ``table``, which was active during the measurement, the effect beyond smooth corrections is subtracted. Of the model book of the
+    machine, the effects are subtracted that apply to this campaign and have another remedy than a table; without a ``store`` none are.
 
     Raises
     ------

@@ -36,7 +36,7 @@ CALIBRATED = ("bar_length", "laser_scale", "cup_", "tilt_")
 """Prefixes of set-up unknowns that cannot be off by five uncertainties: they were calibrated, or such an error would be visible."""
 LASER_REMEDY = "look at beam, mirror and temperature of that set-up, or search for a missing effect: `abbe discover`"
 UNUSUAL = {
-    "cosine": ("the relative length error (beam and mirror askew, or its own wavelength)", LASER_REMEDY),
+    "cosine": ("the relative length error (beam and mirror askew, or a wrong wavelength)", LASER_REMEDY),
     "bar_drift": ("the drift of the centre cup", "look at the cup's clamping, the spindle's temperature and t_s"),
     "drift": ("the drift of the laser", "look at the air, the warming of laser and mirror, and t_s"),
     "zero": ("the error of the first record", "look at the first record: was the machine standing still?"),
@@ -45,7 +45,7 @@ ALL_READINGS = 10**9
 PER_UNKNOWN = 2
 """Readings that a campaign needs for every unknown without a prior."""
 SIX, TWENTY_ONE = 6 + 3, 21 + 3 + 18 + 3
-"""Unknowns of the smallest model of each kind: six, or 21 motions with slope and curvature, each with the lost motion of three axes."""
+"""Unknowns of the smallest model: of rigid6, and of rigid21 with slope and curvature; both with the lost motion of three axes."""
 HELIX_NOTE = (
     "Ten-parameter figures describe the machine on the sphere of their run only, from that run alone. "
     "For the volume use the joint solution."
@@ -230,7 +230,7 @@ def _affordable(data: list[RunData]) -> tuple[Model, list[CampaignIssue]]:
 def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssue | None:
     """Return a flag if the runs do not support 21 error motions: the solved motions are larger, or less certain, than the priors.
 
-    ``instead``: what Abbe does about it; the text ends with it.
+    ``instead``: what Abbe does about it, the end of the flag's text.
     """
     found = None if joint.model == "rigid6" else map_against_prior(joint)
     if found is None or found.carried:
@@ -238,8 +238,8 @@ def beyond_the_prior(joint: JointSolution, *, instead: str = "") -> CampaignIssu
     worst = max(joint.runs, key=lambda run: run.rms_mm / run.expected_mm)
     why = "smooth motions do not fit these readings" if found.read else f"no run measured more than {found.measured_mm * 1e3:.0f} µm rms"
     what = (
-        f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume, for a usual "
-        f"machine {found.prior_mm * 1e3:.0f} µm: {why}{instead}"
+        f"21 error motions would be {found.predicted_mm * 1e3:.0f} ± {2e3 * found.u_mm:.0f} µm rms over the volume; a usual "
+        f"machine has {found.prior_mm * 1e3:.0f} µm: {why}{instead}"
     )
     return CampaignIssue(worst.label, what, "look for the pitch of a screw or a kink of a rail: measure the axes in fine steps", False)
 
@@ -296,7 +296,7 @@ def _longest_contained(names: list[str], unknown: str) -> str | None:
 
 
 def step_diagonals(runs: list[Run]) -> dict[str, dict[str, float]]:
-    """Return step-diagonal results of Wang's method by step order, each with its ``u_`` from noise and wavelength (see `STEP_NOTE`).
+    """Return step-diagonal results of Wang's method by step order, with u (keys ``u_..``) from noise and wavelength (see `STEP_NOTE`).
 
     These are the end errors of the nine curves (um), the largest closure (um, with the u of one closure) and squareness contrasts (urad).
     """

@@ -139,7 +139,8 @@ LISTED = 20
 class Assessment:
     """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed.
 
-    ``scale_free``: the same without the scales, for tables of all the rest; None if scales are not the largest part of the uncertainty.
+    ``scale_free``: the same without the scales, for tables that do not correct scales; None unless scales are the largest part of the
+    uncertainty.
     ``left_out``: the scales that are left out of ``sources`` and its results; ``joint`` still has them.
     """
 
@@ -195,8 +196,8 @@ LARGEST_PART = 0.5
 
 
 def _scale_free(found: Assessment) -> Assessment | None:
-    """Return the assessment without the common scale if it is the largest part of the uncertainty, else without the axes' scales if
-    these are."""
+    """Return the assessment without the common scale if that is the largest part of the uncertainty; else without the scales of the axes
+    if those are the largest part; else None."""
     for scales in SCALE_TEXTS:
         sources = without_scales(found.sources, scales)
         prediction = _over_volume(sources)
@@ -238,7 +239,7 @@ def model_key(joint: JointSolution) -> str:
 
 
 def not_observable(found: Assessment) -> list[str]:
-    """Return errors that the runs cannot separate, the reason, and the measurement that would."""
+    """Return errors that the runs cannot separate, the reason, and the measurement that would separate them."""
     return [g.text for g in found.observability.hidden]
 
 

@@ -150,7 +150,7 @@ def unknown_of(test: AxisReadings) -> list[str]:
     if f"temp_{test.axis.lower()}_C" not in test.further:
         out.append(f"temperature of the scale of {test.axis}: U assumes 15 to 25 °C")
     if test.quantity == "length" and not {"temp_air_C", "pressure_air_Pa"} <= set(test.further):
-        out.append("temperature and pressure of the air, so how the wavelength was compensated: U assumes 15 to 25 °C, 980 to 1040 hPa")
+        out.append("temperature and pressure of the air, for the wavelength: U assumes 15 to 25 °C, 980 to 1040 hPa")
     if test.quantity == "length":
         out.append(MATERIAL_UNKNOWN)
     if test.feed_mm_min is None:

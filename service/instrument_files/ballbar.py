@@ -1,4 +1,4 @@
-"""Renishaw .b5r: results of a ball-bar test, XML (one public reader). No public reader shows where the trace is stored: it is not read."""
+"""Renishaw .b5r: results of a ball-bar test as XML, known from one public reader. The trace is not read: nobody published its place."""
 
 from __future__ import annotations
 

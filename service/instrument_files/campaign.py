@@ -30,7 +30,7 @@ MOST_SAMPLES = 100_000
 
 @dataclass(frozen=True, slots=True)
 class Made:
-    """A campaign made of files, checked like a folder; ``origins``: origin of each file, in order."""
+    """A campaign made of files, checked like a campaign folder; ``origins``: origin of each file, in order."""
 
     folder: FolderContent
     origins: tuple[SourceFile, ...]
@@ -130,7 +130,7 @@ def _columns(test: AxisReadings) -> dict[str, F1]:
     if targets.size > 1 and np.diff(targets).min() < NEAREST_MM:
         raise FileFormatError(
             f"targets are closer than {NEAREST_MM:g} mm: they would count as one",
-            "is the unit of the targets right? Else leave out every second target",
+            "check the unit of the targets; if it is right, leave out every second target",
         )
     zero = np.zeros(n)
     places = {place: test.position_mm if place == f"{test.axis.lower()}_mm" else zero for place in PLACES}

@@ -1,4 +1,4 @@
-"""Tables of an interferometer's signals, or of a slow linear run, and its cyclic error in words and as JSON."""
+"""Tables of an interferometer's signals or of a slow linear run, and the cyclic error that they show, in words and as JSON."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from abbe.service.rendering.numbers import plain, with_uncertainty
 NM = 1e-6
 """One nanometre, mm."""
 WHAT_IT_IS = (
-    "cyclic error of the interferometer (periodic nonlinearity), not of a drive: its period is the fringe; the period of "
-    "cyclic_error is the lead of a screw or the pitch of an encoder"
+    "cyclic error of the interferometer (periodic nonlinearity), not of a drive: its period is the fringe; the effect "
+    "`cyclic_error` has the lead of a screw or the pitch of an encoder as its period"
 )
 CHANCE = 0.01
 UNITS = LENGTHS | ANGLES

@@ -1,4 +1,4 @@
-"""Tables of means: API .pos and the compensation report .REN. Neither says the sign of its values (one public reader each)."""
+"""Tables of means: API .pos and the compensation report .REN. Neither states the sign of its values; one public reader knows each."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", 
 """Words with which a line of a .REN begins, and the field of `_Grid` that the line gives."""
 _UNITS = re.compile(r"(?<![A-Za-z])(millimet(?:re|er)s?|micromet(?:re|er)s?|microns?|mm|um|µm|μm|nm)(?![A-Za-z/])", re.IGNORECASE)
 NEAR = 1e-6
-"""Largest relative difference between a position of a .REN and the one that follows from its start, spacing and number."""
+"""Largest difference of a position in a .REN from start + number * spacing, as a share of the range."""
 Table = tuple[list[float], list[float], list[str], list[int]]
 """Positions, values, the values as printed, line numbers."""
 

@@ -77,8 +77,8 @@ NUMBER = re.compile(r"[-+]?[0-9]+([.,][0-9]*)?([eE][-+]?[0-9]+)?")
 
 
 def likely_heading(path: Path) -> int:
-    """Row that looks most like headings: of the first forty, the one with the most columns of known meaning above a row with a number; 1 if
-    none has two.
+    """Row that looks most like headings: of the first forty rows, the one with the most columns of known meaning, above a row with a
+    number; 1 if no row has two such columns.
 
     Raises
     ------

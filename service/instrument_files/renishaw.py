@@ -1,4 +1,4 @@
-"""Renishaw .rtl and .rta: tests of positioning and of angle, as text in sections (two public readers, one public writer).
+"""Renishaw .rtl and .rta: tests of positioning and of angle, as text in sections. Known from two public readers and one writer.
 
 Numbers are mm for targets; deviations are µm in .rtl and mrad in .rta. The runs of a test in both directions are read alternately along
 the targets and back. Unknown parts of the format are refused, not guessed.

@@ -140,7 +140,7 @@ async def _measured(
 
 
 async def _check_interrupted(context: InvestigationContext, source: RecipeSource, name: str, alarm: int) -> None:
-    """Refuse to resume another campaign than the last one of its recipe, a complete one, or that of another alarm."""
+    """Refuse to resume a campaign that is complete, is not the last one of its recipe, or belongs to another alarm."""
     found = await asyncio.to_thread(interrupted_campaign, context.store, context.site.name, source.recipe)
     if found is None or found.name != name:
         raise PreconditionsChanged(f"campaign {name!r} is complete, or is not the last one of its recipe", "start a new campaign")
@@ -165,7 +165,7 @@ async def _proposed(context: InvestigationContext, by: str) -> JobOutcome:
 
 
 def _check_not_ended(context: InvestigationContext) -> None:
-    """Refuse to measure for a table if a certificate has ended."""
+    """Refuse the campaign if a certificate has ended: no table could follow from it."""
     ended = certificates(context.site, context.clock.utc().date(), needed_by(context.plan).first)
     if ended:
         raise TableRefused("; ".join(ended), "have the instrument calibrated, then start again; nothing was measured")
@@ -195,6 +195,6 @@ class _PromptedPerson:
 
 
 def named_for(context: InvestigationContext, recipe: str, resume: str = "") -> InvestigationContext:
-    """Return the context with a plan of the interrupted campaign's name, or named after recipe, machine and present time."""
+    """Return the context with its plan renamed: ``resume``, or made of recipe, machine and present time."""
     name = resume or f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
     return replace(context, plan=replace(context.plan, name=name))

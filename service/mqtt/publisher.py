@@ -207,7 +207,7 @@ class Publisher:
         self._wake.set()
 
     def set_verified(self, verified: dict[str, Any]) -> None:
-        """Change the part of the state message about the table in force. Every state except offline carries it."""
+        """Change what the state message says about the table in force. Every state message except offline says it."""
         if verified != self._verified:
             self._verified = verified
             self._wake.set()

@@ -1,6 +1,6 @@
 """Rollback to the table that was in force before the push, as a pure function of the journal and of the state of the controller.
 
-The process that began the push runs it, or any later process. It may be interrupted anywhere, also by a crash, and run again.
+The process that began the push or any later process runs the rollback. It may be interrupted anywhere, also by a crash, and run again.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def _arrived(f: PushFacts, known: PushKnowledge) -> Operation:
         return record(PushState.ROLLED_BACK, bank=step.truth.active)
     if known.brackets < BRACKETS:
         return Operation(OperationKind.LOOK, mark=True)
-    return record(PushState.OPERATOR, why="the active bank has the old table's CRC and another content", **mismatch_doc(f, known.start))
+    return record(PushState.OPERATOR, why="the active bank has the old table's CRC but other content", **mismatch_doc(f, known.start))
 
 
 def _switch(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> Operation:
@@ -102,7 +102,7 @@ def _switch(f: PushFacts, known: PushKnowledge, state: PushState, seq: int) -> O
         return (
             record(PushState.ROLLBACK, again="the rollback is no longer blocked")
             if _lease_open(f, truth)
-            else _pending(state, "leased by another")
+            else _pending(state, "another owner has the lease")
         )
     if not known.lease or truth.owner != known.lease:
         return _lease(f, known, truth, state, seq)

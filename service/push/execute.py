@@ -116,13 +116,13 @@ def no_actors() -> PushActors:
     """Actors for a recovery without a person: every question is answered with no."""
 
     async def no_reason(journal: Journal) -> list[str]:
-        return ["no one is present to check it"]
+        return ["no one is present to check the table"]
 
     async def no_approval(journal: Journal) -> o.Approval | None:
         return None
 
     async def no_verdict(journal: Journal) -> o.VerificationResult:
-        return o.VerificationResult(False, "no one is present to measure it")
+        return o.VerificationResult(False, "no one is present to measure the machine")
 
     return PushActors(no_reason, no_approval, no_verdict, no_verdict)
 
@@ -187,7 +187,7 @@ class ControllerPort:
             return o.Done(await self._actors.validate(journal))
         if kind is OperationKind.APPROVE:
             approval = await self._actors.approve(journal)
-            return o.OperationRefused("it was not approved") if approval is None else o.Done(approval)
+            return o.OperationRefused("nobody approved the table") if approval is None else o.Done(approval)
         return o.Done(await self._while_leased(self._actors.probe if kind is OperationKind.PROBE else self._actors.verify, journal))
 
     async def _while_leased(self, question: Callable[[Journal], Awaitable[o.VerificationResult]], journal: Journal) -> o.VerificationResult:

@@ -28,11 +28,11 @@ class OperationOrder:
     machine : str
         Name of the machine.
     image : bytes
-        As the controller will hold it, with its CRC-32 ``crc``.
+        The table's bytes as the controller will hold them; ``crc``: their CRC-32.
     semantic_digest : str
         Digest of the corrections, computed from the tables and not from the image (`abbe.service.push.execute`).
     limits : str
-        Digest of the limits that it was checked against.
+        Digest of the limits that the table was checked against.
     owner : int
         Owner id of the lease, u32. Its low 16 bits are 0: they count the later leases of the same push.
     level : int

@@ -195,7 +195,7 @@ class _AlarmHistory:
         return min(later, default=None)
 
     def _of_alarm(self, found: Sequence[Result], alarm: Alarm, known: int | None) -> Result | None:
-        """The result with the number that the alarm states; if it states none, the newest after the alarm and the last order to search."""
+        """The result whose number the alarm states; if it states none, the newest since the last order to search, else since the alarm."""
         if known is not None:
             return next((one for one in found if one.number == known), None)
         ordered = alarm.last(AlarmKind.ORDERED)

@@ -16,7 +16,7 @@ from abbe.service.verification.trend_table import charts as figure_charts
 from abbe.service.verification.verified_by import VerifiedBy, verified_by
 
 CHECKS = 20_000
-"""Number of latest checks in a trend: more than ten years at four a day."""
+"""Number of latest checks in a trend: more than ten years of four checks a day."""
 UNSCHEDULED: Doc = {
     "schedule": "", "recipe": "", "duration_s": 0.0, "values": {}, "uncertainties": {}, "limits": {}, "runs": [], "text": "",
 }  # fmt: skip
@@ -58,7 +58,7 @@ def latest_checks(reader: Reader, limit: int) -> list[Verification]:
 
 
 def last_good(found: Sequence[Verification], recipe: str) -> Verification | None:
-    """Return the newest of some checks that is of this recipe, passed, and did not verify a push; None: there is none."""
+    """Return the first check of this recipe that passed and did not verify a push; None: there is none. ``found``: newest first."""
     return next((check for check in found if check.verdict == "pass" and check.recipe == recipe and not check.push), None)
 
 

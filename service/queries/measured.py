@@ -213,7 +213,7 @@ class Samples(SampleStretch):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RunColumns(SampleStretch):
-    """A stretch of the evaluated columns of a run (``abbe-run/1``): every reading with its position. null: the column is sealed."""
+    """A stretch of the evaluated columns of a run (``abbe-run/1``), every reading with its position; null: readings are withheld."""
 
     columns: dict[str, list[float | None] | None]
 

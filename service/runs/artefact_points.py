@@ -18,7 +18,7 @@ from abbe.service.errors import MeasurementFault
 FEWEST = 3
 """Smallest number of sensed components of a run."""
 POLE = 1.5
-"""Share by which the variance of a ball's height is larger: one touch and the radius give it, two touches the other directions."""
+"""Share by which the variance of a ball's height is larger: one touch and the radius give the height, two touches each other direction."""
 EXACT = 1e4
 """Weight of a calibrated length, whose error is a separate unknown."""
 
@@ -101,7 +101,7 @@ def _of(artefact: ArtefactObject, name: str) -> dict[str, Any]:
 
 
 def _signs(run: Run, setup: ArtefactSetup, points: ArtefactPoints, rows: NDArray[np.intp]) -> F2:
-    """Direction of each axis' last motion. A hole or ball is touched from both sides, so that lost motion cancels; a wall from outside."""
+    """Direction of each axis' last motion: towards a probed wall; 0 where touches from both sides cancel lost motion."""
     stated = [run.columns.further[f"from_{a}"] for a in "xyz" if f"from_{a}" in run.columns.further]
     if len(stated) == 3:
         return np.asarray(np.column_stack(stated)[rows], dtype=np.float64)

@@ -106,8 +106,7 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
 def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc:
     """Return the times of the edges by the arrivals minus those by the controller, ms of controller time.
 
-    Positive: the arrivals date the edge later than the controller does; according to them, the path began (or ended) before the sync
-    line shows it.
+    Positive: by the arrivals, the edge came after the controller's start (or end) of the path, which the sync line showed too late.
     """
     doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
     path_us = end.path_us

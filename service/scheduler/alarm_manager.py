@@ -126,7 +126,7 @@ class AlarmManager(RetryingStore):
             return None
 
     async def _pushes_settled(self, entries: list[AlarmEntryRecord]) -> list[AlarmEntryRecord]:
-        """Record the end of pushes that the end of the service interrupted, or that were open when last recorded.
+        """Record the outcome of each push that was interrupted when the service stopped, or was still open when last recorded.
 
         The table in force is read from the journal. No push is restarted here.
         """
@@ -159,7 +159,7 @@ class AlarmManager(RetryingStore):
         return (await self._read(JournalView.read, self._store, self._machine)).last_push
 
     async def interrupted(self, found: ApprovedProposal, after: int) -> None:
-        """Record the state of a push at once when the end of the service interrupts it."""
+        """Record at once the state of a push that is interrupted because the service stops."""
         done = await asyncio.to_thread(self._of_proposal, found.proposal, after) or NOTHING_YET
         log.warning("the push was interrupted by the end of the service", word=done.word, text=done.text)
         text = f"{done.text} (stopped because the service stopped)"
@@ -300,7 +300,7 @@ class _Investigation(_AlarmJob):
         return self._last
 
     async def told(self, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Do the work as a part of another job; a line of the alarm tells of a failure."""
+        """Do the work as a part of another job; a failure becomes a line of the alarm."""
         try:
             return await self.work(progress, control)
         except MachineInUse:

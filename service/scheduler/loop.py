@@ -124,7 +124,7 @@ class Scheduler:
         return sorted(due, key=lambda pair: pair[1])
 
     async def run(self) -> None:
-        """Work forever. Cancelling stops a running job by its own cancellation, waits for it, and releases the waiting slots."""
+        """Work forever. When cancelled, cancel a running job, wait until it has ended, and release the waiting slots."""
         now = self._clock.utc()
         since = await self._ledger.in_force_since({one.name: time_rule(one) for one in self._schedules}, now)
         for schedule in self._schedules:

@@ -74,8 +74,10 @@ class SlotLedger(Protocol):
         ...
 
     async def in_force_since(self, rules: Mapping[str, str], now: datetime) -> dict[str, datetime]:
-        """Return since when each schedule has its present time rule: ``now`` for a new or changed one. ``rules``: by name; others are
-        forgotten."""
+        """Return the time from which each schedule has its present time rule; ``now`` for a new or changed rule.
+
+        ``rules``: the time rule of each schedule; schedules without a rule here are forgotten.
+        """
         ...
 
     async def last_claimed(self, schedule: str) -> datetime | None:
@@ -95,7 +97,7 @@ class Readiness(Protocol):
         ...
 
     def continue_from(self, earlier: Readiness) -> None:
-        """Take over the history of the machine that the service had before it started anew."""
+        """Take over the machine's history, which was recorded before the service started anew."""
         ...
 
 

@@ -128,7 +128,7 @@ class Ready:
             await self._clock.sleep(LOOK_S)
 
     def continue_from(self, earlier: Readiness) -> None:
-        """Take over when the machine was seen at work."""
+        """Take over the times at which the machine was seen at work."""
         if isinstance(earlier, Ready):
             self.active_s, self.position_mm = earlier.active_s, earlier.position_mm
 

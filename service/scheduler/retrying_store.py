@@ -80,8 +80,7 @@ class StoreLedger(RetryingStore):
         await self._write(self._store.slots.finish, self._key(schedule), slot_utc, state[:30], reason)
 
     async def in_force_since(self, rules: Mapping[str, str], now: datetime) -> dict[str, datetime]:
-        """Return since when each schedule has its present time rule: ``now`` for a new or changed one. ``rules``: by name; others are
-        forgotten."""
+        """Return the time from which each schedule has its present time rule, as `SlotLedger.in_force_since`."""
         key = f"/{self._machine}"  # begins as no schedule's key does; one row, changed in place
         rows = await self._read(self._store.slots.latest, key, 1)
         known = json.loads(rows[0].reason or "{}") if rows else {}

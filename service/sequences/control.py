@@ -1,4 +1,5 @@
-"""Reasons to stop motion: requests of people (`Control`), conditions in the status of the machine (interlocks), another table or boot.
+"""Reasons to stop motion: requests of people (`Control`), conditions in the status of the machine (interlocks), and a controller that
+was restarted or has another table.
 
 A `Control` pauses, resumes, stops and aborts a measurement, and reports its state. Call it in the event loop of the measurement; from a
 signal handler or another thread use ``loop.call_soon_threadsafe``.
@@ -50,7 +51,7 @@ AT_WORK = frozenset({"door"})
 PAUSED = frozenset({"door", "mode", "drives", "program", "spindle", "temperature", "beam"})
 """Conditions that a person may cause during a pause; checked again before the measurement resumes."""
 CAN_CLEAR = frozenset({"door", "beam", "temperature"})
-"""Conditions that may only suspend a run; all others, such as e-stop and alarm, end it."""
+"""Conditions that may suspend a run instead of ending it; all others, such as e-stop and alarm, end it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,7 +31,7 @@ from abbe.service.sequences.journal import INCIDENT, OUTCOME, Journal
 
 AIR_PERIOD_S = 1.0
 LASER_UNKNOWN_S = 2.5
-"""Longest silence of the laser: on a serial line one lost reply costs a second, and only a reading depends on it."""
+"""Longest silence of the laser: on a serial line one lost reply costs a second, and only readings depend on the laser."""
 RETRY_S = 0.02
 LATE_S = 0.1
 """A wake-up that is later than this, s, means that this computer stalled: the watcher asks once more before it calls the status unknown."""

@@ -21,7 +21,7 @@ from abbe.service.verification.verify import NAMES, judge
 
 @dataclass(frozen=True, slots=True)
 class AlarmTerms:
-    """Checks to evaluate (those of ``recipe`` after ``begins_utc``), and the terms.
+    """The checks to evaluate (those of ``recipe`` after ``begins_utc``), and when they raise an alarm.
 
     ``warn_days``: warn so many days ahead of the limit, 0 for never. ``compare``: figure -> value and standard uncertainty before the
     active alarm, so that the figures after a jump do not become its reference.
@@ -64,7 +64,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """Reference for a jump (value, standard uncertainty): from ``terms.compare``, else the mean of few earlier checks, else None."""
+    """Reference for a jump (value, standard uncertainty): ``terms.compare``, else the mean of earlier checks if they are few, else None."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept

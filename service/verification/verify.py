@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""Share by which a figure may get worse beyond its U: for a diagonal and its reversal, of the worst diagonal before; for a helix, of its
-own value."""
+"""A figure may get worse by its U plus this share of a reference: the worst diagonal before for a diagonal and its reversal, the figure
+before for a helix."""
 
 SAME_AIR_C = 1.0
 """Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is

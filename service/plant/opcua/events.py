@@ -15,7 +15,7 @@ from abbe.service.plant.opcua.space import short_text
 from abbe.service.plant.opcua.types import Types
 
 SEVERITIES = {"pass": 100, "cannot tell": 500, "fail": 800}
-"""Severity of a result, 1 to 1000 (OPC 10000-5, 6.4.2); that of an alarm is the highest."""
+"""Severity of a result, 1 to 1000 (OPC 10000-5, 6.4.2); an alarm has the highest."""
 
 
 class News:
@@ -24,7 +24,7 @@ class News:
     Facts hold only the newest alarms. If an alarm leaves the full list, an older one returns to the list and is not new. An alarm has the
     time at which its check began, so alarms may arrive out of order.
 
-    ``since``: checks that ended before this time, and alarms of the first facts from before this time, are not new.
+    ``since``: a check that ended before this time is not new, nor is an alarm in the first facts that was raised before it.
     """
 
     def __init__(self, since: datetime) -> None:

@@ -21,7 +21,7 @@ STEP_MM = 1.0
 LONG_MM = 200.0
 """Assumed length of a shaft without a stated length, and of the probe's body above it."""
 ROUNDS = 28
-"""Number of thirds in the search for the nearest place on a part: they find it to 1/80,000 of the part's length."""
+"""Steps of the ternary search for the nearest place on a part: they find it to 1/80,000 of the part's length."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,8 +101,8 @@ class Boxes:
         return self._rod(places_mm, up, part.from_mm, part.to_mm) - part.radius_mm
 
     def _rod(self, places_mm: Array, up: Array, from_mm: float, to_mm: float) -> Array:
-        """Return the least distance of each body from lines that begin above these places, (bodies,), by thirds: it is convex along a
-        line."""
+        """Return the least distance of each body from lines that begin above these places, (bodies,), by ternary search: the distance
+        is convex along a line."""
         own, along = ((places_mm - self.origin_mm) @ self.matrix)[:, None], up @ self.matrix
         shape = (len(places_mm), len(self.names))
         low, high = np.full(shape, from_mm), np.full(shape, to_mm)
