@@ -370,7 +370,7 @@ def files_ready(key_file: Path, head_file: Path) -> None:
 def files_base(store: Store | None, url: str) -> str | None:
     """Return the path of the audit's files, without suffix; None for a database in memory.
 
-    ``store`` None: ``url`` names a SQLite file.
+    Without a ``store``, ``url`` names a SQLite file.
     """
     parsed = parse_url(url)
     folder = os.environ.get(ENVIRONMENT)
@@ -389,7 +389,10 @@ def files_base(store: Store | None, url: str) -> str | None:
 
 
 def _anchor(line: str) -> Anchor | None:
-    """Parse a line of the heads file; None for a line cut short by a power cut. Skipping it helps no attacker, who could also remove it."""
+    """Parse a line of the heads file; None for a line cut short by a power cut.
+
+    An attacker gains nothing by such a line: removing it does the same.
+    """
     parts = line.split(" ")
     if len(parts) == 3 and parts[0].isdigit() and [len(part) for part in parts[1:]] == [64, 64] and len(parts[0]) < 18:
         return Anchor(int(parts[0]), parts[1], parts[2])

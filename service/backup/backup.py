@@ -115,7 +115,7 @@ def digest_of(path: Path) -> str:
 
 
 def file_list(folder: Path) -> dict[str, ListedFile | None]:
-    """Return the files below a folder by relative path, except list and pieces; None for anything but a plain file. Raises OSError."""
+    """Return the files below a folder by relative path, except list and pieces; None for a link, pipe or device. Raises OSError."""
     found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
         if path.parent == folder / PIECES:

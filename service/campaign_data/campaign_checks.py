@@ -25,7 +25,7 @@ from abbe.service.errors import CampaignRefused
 
 @dataclass(frozen=True, slots=True)
 class CampaignIssue:
-    """One mistake in one run, or in two that contradict each other.
+    """One mistake in one run, or in two runs that contradict each other.
 
     ``refuse``: the campaign must not be solved; otherwise the issue is a flag beside the result.
     """
@@ -42,7 +42,7 @@ class CampaignIssue:
 
 
 FASTEST = 0.2
-"""Smallest possible ratio of a run's duration to the duration at its feed: the programmed feed is the upper limit."""
+"""Smallest plausible ratio of a run's duration to the duration at its feed: a smaller one means a wrong unit of t_s or a wrong feed."""
 SLOWEST = {"ballbar": 10.0, "laser": 200.0}
 """Largest ratio of a run's duration to the duration at its feed: a ball-bar run moves steadily, a laser run stops at every point."""
 OVERLAP = 0.1
@@ -115,12 +115,12 @@ OTHER_FEED = 0.3
 """Largest relative difference between the stated feed of a ball-bar run and the median feed from its positions and times. Beyond it the
 column is wrong."""
 AGREE, ALIKE = 0.65, 4
-"""Smallest share and number of runs of one kind that agree in direction and sense of rotation, so that the column of the others is
-wrong."""
+"""Smallest share of runs whose direction agrees with their sense of rotation, and smallest number of runs of one kind: from these on the
+column of the other runs is wrong."""
 
 
 def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flag ball-bar runs whose feed_mm_min or direction contradicts their positions and times, which the search then uses."""
+    """Flag ball-bar runs whose feed_mm_min or direction contradicts their positions and times; the search then uses these."""
     out = []
     senses: dict[tuple[str, int], dict[str, float]] = {}
     for run in runs:
@@ -288,7 +288,7 @@ def _constant(run: Run) -> bool:
 
 
 def geometry_issues(machine: Doc, run: Run) -> list[CampaignIssue]:
-    """Return the issues of a run whose points do not lie where its set-up says, or outside the strokes."""
+    """Return the issues of a run with points that do not lie where its set-up says, or that lie outside the strokes."""
     what = geometry_mistake(machine, run)
     return [CampaignIssue(run.run_id, what.text, what.remedy, what.refuse)] if what else []
 
@@ -303,7 +303,7 @@ def _other_machine(machine: Doc, run: Run) -> list[CampaignIssue]:
     for key, title in (("name", "name"), ("chain", "chain"), ("stroke_mm", "strokes"), ("pivots_mm", "pivots"), ("tool_mm", "tool")):
         ours, other = machine.get(key), theirs.get(key)
         if ours is not None and other is not None and not _same(ours, other):
-            what = f"measured on another machine: {title} {_short(other)}, the campaign's is {_short(ours)}"
+            what = f"measured on another machine: {title} {_short(other)}, the campaign states {_short(ours)}"
             return [CampaignIssue(run.run_id, what, "leave it out (--without), or correct its machine object", True)]
     return []
 

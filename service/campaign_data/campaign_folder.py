@@ -67,7 +67,7 @@ class Campaign:
         FileFormatError
             The folder exists and is not empty, or cannot be written.
         Unusable
-            The campaign is of a database, which alone holds its tables; or a table was subtracted from the readings.
+            The campaign comes from a database, and only the database holds its tables; or a table was subtracted from the readings.
         """
         errors = self.doc.get("current_model", {}).get("errors")
         acting = {run.table.acting_crc for run in self.runs if run.table.acting_crc is not None}

@@ -89,7 +89,7 @@ def _setup_unit(points: F2, centre: F1, radius: float, place: str) -> GeometryMi
 
 
 def _artefact(setup: ArtefactSetup, known: dict[str, Feature], columns: Columns) -> GeometryMistake | None:
-    """Compare the deviation of each probed point with its position, pose and nominal place; walls are read at the stylus' radius."""
+    """Compare the deviation of each hole or ball with its position, pose and nominal place; walls are not compared."""
     names = [str(name) for name in columns.further[FEATURE]]
     read = np.column_stack([columns.further.get(f"deviation_{a}_mm", np.full(len(names), np.nan)) for a in AXES]).astype(np.float64)
     nominal = np.array([known[name].nominal_mm if known[name].normal is None else [np.nan] * 3 for name in names])

@@ -95,7 +95,7 @@ class BarPlaces:
         return recipe.path()[0][-1]
 
     async def clear_away(self) -> None:
-        """Take cup and bar out if they are mounted; an error gets the note that they may still be in."""
+        """Take cup and bar out if they are mounted; an error gets the note that they may still be mounted."""
         if not self.mounted:
             return
         try:
@@ -107,7 +107,7 @@ class BarPlaces:
 
     @asynccontextmanager
     async def cleared_away(self) -> AsyncIterator[None]:
-        """After the block, take cup and bar out, or warn that they may still be mounted: the next motion goes down to the centre."""
+        """After the block, take cup and bar out, or warn that they may still be mounted: the next motion could hit them."""
         try:
             yield
         except (TableRefused, PushNotBegun, MeasurementFault) as error:  # the axes stand, and a person can reach in

@@ -33,7 +33,7 @@ from abbe.service.sequences.steps import (
 BEFORE_S = 5.0
 """Longest search for the ball-bar's box before a run."""
 BAR_RANGE_MM = 0.1
-"""Minimum stroke of the bar to either side: machine errors are tens of micrometres, and a clamped reading has no information."""
+"""Minimum stroke of the bar to either side: machine errors are tens of micrometres, and a reading at the end of the stroke says nothing."""
 LASER_S = 2.0
 """Longest wait for a new sample of the laser, which delivers twenty per second."""
 POLL_S = 0.02

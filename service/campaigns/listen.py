@@ -41,7 +41,7 @@ Report = Callable[[str], None]
 STATUS_EVERY = 3
 """Number of laser readings between two controller statuses."""
 QUIET = 4.0
-"""Without a "program running" status, a test has ended after this many of its longest dwells without motion."""
+"""Without a "program running" status, a test has ended when the axes have rested for this multiple of its longest dwell."""
 MOVED_MM = 0.05
 START_MM = 0.05
 POLL_S = 0.05

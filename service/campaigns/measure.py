@@ -101,7 +101,7 @@ class ProgressReporter:
             self._waits_since_s = None
 
     def skip(self, duration_s: float) -> None:
-        """Count a test that was complete before this job began as done; the pace that gives the ETA does not use its planned time."""
+        """Count as done a test that was complete before this job began; its planned time does not enter the pace that gives the ETA."""
         self.done_s += duration_s
         self.skipped_s += duration_s
 
@@ -177,8 +177,8 @@ class MeasureOptions:
     """Options of a measurement.
 
     ``control``: pauses, stops or aborts it. ``confirm``: asks a person whether a set-up is untouched. ``source``: where the plan comes
-    from, for `abbe measure --resume`. ``resumed``: where an interrupted campaign resumes. ``part``: the job of ``control`` continues
-    after this measurement. ``live``: receives the readings of paths.
+    from, for `abbe measure --resume`. ``resumed``: where an interrupted campaign resumes. ``part``: whether the job of
+    ``control`` continues after this measurement. ``live``: receives the readings of paths.
     """
 
     control: Control | None = None
@@ -324,7 +324,7 @@ async def _all_tests(
 def _once(
     session: Session, store: Store, site: Site, under_way: OpenCampaign, reporter: ProgressReporter, live: LiveFeed | None
 ) -> Callable[[TestPlan, float], Once]:
-    """Return a factory of functions that run one attempt at a test as one run."""
+    """Return a function that makes, for a test, the function that runs one attempt at it as one run."""
 
     def of(test: TestPlan, base_s: float) -> Once:
         breaks = BarBreaks(session, reporter.control or Control(), site.watching.suspending)
@@ -439,8 +439,10 @@ async def start_document(
 
 
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
-    """Return the number of standstill readings in a whole run: those of its steps and the kept ones, except a last one that is read
-    again. A qualification sphere is no reading."""
+    """Return the number of standstill readings in a whole run: one per reading step, and those kept from before an interruption.
+
+    A kept reading that is read again counts once. A qualification sphere is no reading.
+    """
     count = sum(isinstance(s, ReadLaser | ReadBar) or (isinstance(s, TouchFeature) and not s.qualifies) for s in test.steps)
     trail = attempt.resume_trail
     return {"standstills": count + (trail.n_features if trail.again else max(0, len(trail.carried) - 1))} if count else {}

@@ -117,7 +117,7 @@ def at_this_machine(tools: Instruments, site: Site) -> tuple[Instruments, tuple[
 BOUND_NOTE = (
     "U is the smallest that these readings allow (Bayesian Cramer-Rao bound), over the inner 80 % of the volume, rigid motion removed, "
     "temperature of the scales included. `abbe solve` may state a larger U: it also includes error motions of higher orders, and the "
-    "uncertainty of the estimated noise and typical sizes. On a machine better than a typical one, its U is smaller"
+    "uncertainty of the estimated noise and typical sizes. On a machine better than a typical one, `abbe solve` states a smaller U"
 )
 
 
@@ -212,8 +212,8 @@ def temperature_note(plan: MeasuringPlan) -> str:
     """Describe the part of U that no measurement can reduce."""
     inputs = plan.tools.inputs
     return (
-        f"every U includes the temperature of the scales, known to {inputs.u_scale_temperature_k:g} K "
-        f"({inputs.scale_expansion_per_k * 1e6:g} µm/m/K); this alone makes U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
+        f"every U includes the temperature of the scales (standard uncertainty {inputs.u_scale_temperature_k:g} K, "
+        f"{inputs.scale_expansion_per_k * 1e6:g} µm/m/K); this alone makes U = {_um(COVERAGE * plan.u_temperature_mm)} µm"
     )
 
 

@@ -79,7 +79,9 @@ def read_artefact(path: Path) -> tuple[str, ArtefactObject]:
 
 
 def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, progress: ProgressSink = ignore_progress) -> PosePlan:
-    """Choose poses one after the other until the minutes are used up: in a plane by the fields that they show and then by U, in space by U.
+    """Choose poses one after the other until the minutes are used up.
+
+    In a plane the pose that shows the most fields of the map wins, then the one with the smallest mean U; in space only the mean U counts.
 
     Raises
     ------
@@ -114,8 +116,10 @@ def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, pro
 
 
 def _offered(site: Site, name: str, plate: ArtefactObject) -> Iterator[tuple[ArtefactTest, TestPlan, DryRun]]:
-    """Poses at quarter turns, at the ends and in the middle of X and Y, and shifted by a part of a pitch; balls also tilted, unless the
-    stylus would meet one of them; those inside the strokes."""
+    """Yield the poses inside the strokes: at quarter turns, at the ends and in the middle of X and Y, and shifted by a part of a pitch.
+
+    Balls are also tilted, unless the stylus would meet another ball.
+    """
     nominal = np.array([f.nominal_mm for f in plate.features])
     pitch = float(np.median(np.sort(np.linalg.norm(nominal[:, None] - nominal[None], axis=2), axis=1)[:, 1])) if len(nominal) > 1 else 0.0
     for tilt, turn in product((0.0, TILT_DEG) if _may_tilt(plate) else (0.0,), (0.0, 90.0, 180.0, 270.0)):
@@ -144,7 +148,7 @@ def _may_tilt(plate: ArtefactObject) -> bool:
 
 
 def _points(plans: list[TestPlan], levels: int) -> F2:
-    """Points over what the artefact can reach: of the plane (one level), or of space."""
+    """Return a grid of points over the places that the artefact can reach: on one level for a plane, on several for space."""
     reach = np.array([s.centre_mm for plan in plans for s in plan.steps if isinstance(s, TouchFeature)])
     low, high = reach.min(axis=0), reach.max(axis=0)
     z = np.array([reach[:, 2].mean()]) if levels == 1 else np.linspace(low[2], high[2], levels)

@@ -76,12 +76,12 @@ async def resume(session: Session, store: Store, site: Site, plan: CampaignPlan,
     """Find out where a campaign resumes. Stops a motion that is still running; nothing else moves.
 
     ``plan`` must be the original one. ``confirm`` asks whether a set-up with complete runs is untouched; if not, it is mounted anew. None:
-    nobody is asked, and every set-up with a test that is left is mounted anew, after a prompt to clear away what is mounted.
+    nobody is asked, and every set-up with a remaining test is mounted anew, after a prompt to clear away what is mounted.
 
     Raises
     ------
     PreconditionsChanged
-        The plan, the machine or the table is another, or the controller was restarted.
+        The plan, the machine or the table has changed, or the controller was restarted.
     UnsafeToMove
         Another process is measuring the campaign, or an interlock holds.
     """

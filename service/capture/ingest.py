@@ -24,7 +24,7 @@ TOGETHER_S = 0.25
 """Longest time that a record waits for others to share its transaction. The segment keeps it safe meanwhile; one transaction per record
 (100 per second) would cost more than the rest of the capture."""
 TOGETHER_BYTES = 1 << 16
-"""Queued records of this total size are written at once: on a full disk the database must get all of them, and the reserve is small."""
+"""Queued records of this total size wait no longer: on a full disk the database must get all of them, and the reserve is small."""
 
 
 def chunk_of(record: Record) -> ChunkRecord:

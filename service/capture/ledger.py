@@ -346,7 +346,7 @@ def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
 
 
 def streams_from_end_doc(end_doc: dict[str, Any] | None) -> dict[int, int] | None:
-    """Return the stream of every chunk by its number, from the run's end document; None if it states none (open run, or older version)."""
+    """Return the stream of every chunk by its number; None if the run's end document states none (open run, or older version)."""
     spans = ((end_doc or {}).get("capture") or {}).get("streams")
     if spans is None:
         return None

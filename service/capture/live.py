@@ -26,9 +26,9 @@ F1 = NDArray[np.float64]
 Values = NDArray[np.float32]
 
 MOST_BATCHES = 2000
-"""Maximum number of waiting batches: enough for the seconds in which the page process restarts."""
+"""Maximum number of waiting batches: enough for the seconds in which the web process restarts."""
 LONGEST = 4096
-"""Maximum number of deviations per stretch: channel messages are bounded, and a longer one would end the page process."""
+"""Maximum number of deviations per stretch: channel messages are bounded, and a longer one would end the web process."""
 ANGLES = 512
 """Number of path positions whose angle is sent; the browser interpolates between them."""
 UM_PER_NM = 1e-3

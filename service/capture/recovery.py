@@ -245,7 +245,7 @@ def _take_over(store: Store, path: Path, run: RunRecord | None, settings: Captur
 
 
 def _of_closed(store: Store, path: Path, run: RunRecord, scanned: Scan, settings: CaptureSettings) -> RecoveredRun | None:
-    """Handle the segment of a run that was closed before the file was deleted, or by another process without the file."""
+    """Handle the segment of a closed run, left by a process that ended too early, or by one that closed the run without the file."""
     if settings.keep:
         return None
     keys = store.chunks.crcs(run.id)

@@ -317,7 +317,7 @@ def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
      first_us, last_us, first_host_s, last_host_s, utc_offset_s, previous, _) = fields  # fmt: skip
     if version != VERSION:
         raise CaptureFault(
-            f"a record of format {version}: this segment was made by a newer version of this program",
+            f"a record has format {version}: this segment was made by a newer version of this program",
             "start the newer version once: it recovers the run; nothing was changed",
         )
     payload = bytes(data[at + HEAD_BYTES : body_end])

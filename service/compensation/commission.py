@@ -1,8 +1,8 @@
 """Commissioning of a control's tables: write a known step, measure it with the ball-bar, and infer sign, axis and unit.
 
-A first step of half a micrometre shows a wrong unit without harm: if read in millimetres, it is half a millimetre, within the bar's
-stroke. Then each axis gets a step of 10 µm, which is rolled back before the next one. The bar stays mounted throughout. Every table goes
-through the push machine like any other, and any failure rolls back.
+A first step of half a micrometre shows a wrong unit without harm: a control that reads millimetres moves half a millimetre, which is within
+the bar's stroke. Then each axis gets a step of 10 µm, which is rolled back before the next one. The bar stays mounted throughout. Every
+table goes through the push machine like any other, and any failure rolls back.
 """
 
 from __future__ import annotations

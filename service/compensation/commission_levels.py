@@ -1,4 +1,4 @@
-"""Commissioning of a controller's capabilities: each flag is proved by attempts that it must refuse and attempts that it must accept.
+"""Commissioning of a controller's capabilities: it must refuse some attempts and accept others, which proves each flag.
 
 The inactive bank holds a copy of the table in force for every attempt. So the same corrections act as before, whatever the controller
 wrongly accepts and wherever the test is interrupted. No person has to open, press or restart anything; capabilities that only such an

@@ -36,11 +36,11 @@ async def commission_one_bank(controller: Controller, store: Store, site: Site) 
     Raises
     ------
     TableRefused
-        The control has two banks: they are safer.
+        The control has two banks, which are safer.
     Interlock, UnsafeToMove
         The machine is not ready, or an axis moves.
     TableMismatch
-        No table acts, or another one acts after the test.
+        No table acts, or another table acts after the test.
     DriverError
         The link failed: look at the control, compensation may be off.
     """

@@ -277,7 +277,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool, turned: bo
         if form.sign.sure:
             continue
         if turned is not None:
-            out.append(f"{form.name}: sign by the measured step: {'opposite to that' if turned else 'as'} in docs/reference/formats.md")
+            out.append(f"{form.name}: sign by the measured step: {'opposite to' if turned else 'as in'} docs/reference/formats.md")
         else:
             out.append(
                 f"{form.name}: no manual states the sign ({form.sign.text}): write the 10 µm step first and measure it "

@@ -173,7 +173,7 @@ def _misfit_mm(solved: Solved, before: list[Run], table: NineTables | None) -> f
 
 
 def _as_other_runs(run: Run, solved: Solved, table: NineTables | None) -> Run:
-    """Prepare a run like the solved runs: remove the effect of the table in force beyond its smooth corrections."""
+    """Prepare a run like the solved runs: subtract what the table in force does beyond its smooth corrections."""
     if table is None:
         return run
     lost = np.array([v for v, _ in solved.joint.backlash_mm().values()])

@@ -148,7 +148,7 @@ def take_back(source: Path) -> Drop:
     Raises
     ------
     FileFormatError
-        There is no receipt, or a file there is neither the dropped one nor the one before.
+        There is no receipt, or a file at the control is neither the dropped file nor the previous one.
     DriverError
         The server of the files does not answer.
     """

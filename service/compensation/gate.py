@@ -119,7 +119,7 @@ class PushPrecheck:
             yield f"APPROVAL: {why}"
 
     def approval(self, clock: Clock) -> Approval | None:
-        """The approval that the push machine checks against its readings; None where the person who orders the push approves it."""
+        """The approval that the push machine checks against the controller; None where the person who orders the push approves it."""
         if not self._needs_approval:
             return None
         found, why = valid_approval(self.proposed, self.approvals, clock.utc().timestamp(), two_people=self.site.two_people)

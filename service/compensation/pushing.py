@@ -34,7 +34,7 @@ from abbe.service.tables.push_journal import STILL_ACTIVE, operator_needed
 
 MAKE_READY = "make the machine ready (interlocks, link); the next abbe command rolls the table back before anything else"
 UNTRUSTED_CONTROL = (
-    "move nothing; activate the old table at the control, and commission the control again: it does something else than it answers"
+    "move nothing; activate the old table at the control, and commission the control again: its answers contradict what it does"
 )
 MAY_BE_ACTIVE = f"a new table that was not verified may be in force; {MAKE_READY}"
 APPROVED_S = 3600.0

@@ -104,7 +104,7 @@ class FileChanges:
         return _answer(asked, "done", "")
 
     async def _check_rights(self, who: str, keys: Iterable[str], closed: str = "[{section}] cannot be changed on the page") -> None:
-        """Refuse keys of sections that the page does not change, and of those that a person may not change."""
+        """Refuse a key whose section the page does not change, or this person may not change."""
         needed = {Permission.CONFIGURE} if not keys else set[Permission]()
         for key in keys:
             if (section := section_of(key)) not in RIGHTS:
@@ -135,7 +135,7 @@ class FileChanges:
         return _Plan(old, new, found, self._source.prepare(new))
 
     def _written(self, asked: ChangeFile, plan: _Plan) -> ServiceSetup:
-        """Write the file with its record in the audit; a command that uses the machine meanwhile is refused, and refuses the change."""
+        """Write the file with its record in the audit, under the machine's lock. Raises MachineInUse while a command has the lock."""
         begun = _event(asked, plan.old, plan.new, plan.found)
         with lock_machine(self._context.cnc):
             self._context.audit.write(begun)

@@ -58,7 +58,7 @@ MAX_SAMPLES_PER_S = 6000
 CERTIFICATES = {kind: date(2099, 12, 31) for kind in ("ballbar", "laser", "artefact")}
 """Last days of the certificates: far away, since simulated instruments need no calibration."""
 SIMULATED = Watching(unknown_s=5.0)
-"""A simulated controller is a program of this computer: while it waits for a processor it is silent, and nothing moves."""
+"""A longer wait for a silent controller: a simulated one is a program of this computer, silent and still while it waits for a processor."""
 FIRST_TABLE_LIMITS = PushLimits(value_mm=0.2, change_mm=0.2, walk_mm=0.2)
 """Wide limits: the first table of an uncorrected machine changes every correction from zero to its full value."""
 

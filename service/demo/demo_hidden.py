@@ -211,7 +211,7 @@ def summary_lines(result: HiddenDemo) -> list[str]:
 
 
 def _gap_text(gap: GapUm) -> str:
-    return f"gap {plain(gap.before_um)} -> {plain(gap.after_um)} µm rms, {plain(gap.floor_um)} µm is noise"
+    return f"gap {plain(gap.before_um)} -> {plain(gap.after_um)} µm rms (noise alone: {plain(gap.floor_um)} µm)"
 
 
 def _model(result: HiddenDemo) -> list[str]:
@@ -250,12 +250,12 @@ def judged(result: HiddenDemo) -> tuple[bool, str]:
     label = secret.label
     if secret.name not in {e.name for e in catalogue()}:
         right = finding.verdict == "unknown" and not named
-        return right, f"hidden was {label}, which the catalogue does not hold; the answer was {', '.join([finding.verdict, *named])}"
+        return right, f"the hidden effect was {label}, which the catalogue lacks; the answer was {', '.join([finding.verdict, *named])}"
     right = finding.verdict == "named" and named == [label]
     also = [n for n in named if n != label]
     if label in named and also:
-        return False, f"hidden was {label}; it was named, but so was {', '.join(also)}, which is not in the machine"
-    return right, f"hidden was {label}; the answer was {', '.join(named) or finding.verdict}"
+        return False, f"the hidden effect was {label}; it was named, but so was {', '.join(also)}, which is not in the machine"
+    return right, f"the hidden effect was {label}; the answer was {', '.join(named) or finding.verdict}"
 
 
 def truth_lines(result: HiddenDemo) -> list[str]:

@@ -16,13 +16,17 @@ from abbe.service.identification.solve import Solved, solve_runs
 
 FORMAT = "abbe-artefact-finding/1"
 LEFT = 2.0
-"""Points that scatter by more than this factor of their repeatability have an error that neither part nor machine explains."""
+"""Points that scatter by more than this multiple of their repeatability have an error that neither part nor machine explains."""
 
 
 @dataclass(frozen=True, eq=False)
 class ArtefactFinding:
-    """``shares``: shares of part and machine in the named fields, empty unless one plate lay in several poses in a plane (``rank``).
-    ``waves``: periods of the machine's motions that are sure. ``scatter``: scatter of the points as a multiple of their repeatability."""
+    """What a campaign of artefacts shows of part and machine.
+
+    ``rank``: the fields that the poses show, None unless one plate lay in several poses in a plane; ``shares``: shares of part and machine
+    in these fields, else empty. ``waves``: sure periods of the machine's motions. ``scatter``: scatter of the points as a multiple of their
+    repeatability.
+    """
 
     campaign: str
     solved: Solved

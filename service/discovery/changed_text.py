@@ -88,13 +88,13 @@ def _proof(changed: ChangedSince) -> list[str]:
     before, after, floor = plain(gap.before_um), plain(gap.after_um), plain(gap.floor_um)
     if _shows(gap):
         share = gap.closed or 0.0
-        goes, part = ("shrinks", f" ({share:.0%} closed)") if share > 0.0 else ("goes", "")
-        gap_text = f"the gap {goes} from {before} to {after} µm rms where {floor} µm is noise{part}"
+        goes, part = ("shrinks", f", {share:.0%} closed") if share > 0.0 else ("goes", "")
+        gap_text = f"the gap {goes} from {before} to {after} µm rms (noise alone: {floor} µm{part})"
         out = [f"  on runs that were not used to find the change, {gap_text}"]
     else:
         out = [
             f"  the fitted set-ups absorb nearly all of the change: "
-            f"the gap is {before} µm rms without and {after} with it where {floor} µm is noise"
+            f"the gap is {before} µm rms without it and {after} µm rms with it (noise alone: {floor} µm)"
         ]
     if judged < NEAR:
         out.append("  the change does not explain the runs that were kept out of the search for it")

@@ -123,7 +123,7 @@ async def measure_added(
     Raises
     ------
     CampaignRefused
-        The controller's clock or its active table is not that of the old campaign; nothing has moved.
+        The controller was restarted since the old campaign, is another one, or has another table active; nothing has moved.
     UnsafeToMove, MeasurementFault, DriverError
         The machine still moves on the path of an interrupted run, or the measurement failed.
     """
@@ -159,7 +159,7 @@ def _last_s(campaign: Campaign) -> float:
 
 
 def next_search(store: Store, job: DiscoveryJob, journal: StoredJournal, name: str) -> tuple[DiscoveryJob, StoredJournal]:
-    """Prepare the search of a campaign joined with the added campaign ``name``; ``journal`` is that of the ended previous search.
+    """Prepare the search of a campaign joined with the added campaign ``name``; ``journal``: journal of the previous search.
 
     The new search contains the readings of the previous one. So it starts from the same model version, and its finding replaces the
     previous one.

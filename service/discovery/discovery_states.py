@@ -33,7 +33,7 @@ LEFT = 1.5
 """Unproved effects explain a gap only if they leave less than this multiple of the noise. A smaller rest may be an error of the
 prediction, so it does not refute an effect that makes the holdout runs agree better."""
 FELT = 0.01
-"""Smallest relative change of the rms of the holdout runs, with and without one effect, at which these runs can judge it."""
+"""Smallest share by which one effect changes the rms of the holdout runs so that these runs can judge the effect."""
 WORSE = 1.05
 """Largest ratio of the gap with the effect to the gap without it, in the runs of any role: a diverged solution is not a finding."""
 NEAR = 3.0
@@ -51,7 +51,7 @@ def after_fit(finding: Finding) -> Iterator[DiscoveryStep]:
     if not _names(finding):
         yield DiscoveryStep(state="UNEXPLAINED", why=finding.doubt or "nothing in the catalogue explains the gap")
         return
-    yield DiscoveryStep(state="PROPOSED", why="has the best evidence, with all rivals refitted")
+    yield DiscoveryStep(state="PROPOSED", why="these effects have the best evidence, with all rivals refitted")
     judged = judge(finding)
     yield DiscoveryStep(state="TESTING", why=judged.rule, judged=judged)
     yield ending(finding, judged)
@@ -85,7 +85,7 @@ def not_entered(finding: Finding, judged: Judgement) -> str | None:
 
 
 def with_proof(finding: Finding) -> Finding:
-    """Add the result of the holdout runs to a finding. Effects that they refute become suspects, and the verdict becomes "unknown"."""
+    """Add the result of the holdout runs to a finding. Effects that they refute become suspects; the verdict is then "unknown"."""
     if not finding.effects:
         return finding
     judged = judge(finding)
@@ -175,7 +175,7 @@ def nothing_missing(finding: Finding) -> str:
     if off:
         runs = _few([f"{a.run} {a.times:.2g} times" for a in off])
         text += (
-            f"; runs that were never fitted deviate by more than noise and the uncertainty of the prediction allow: {runs} as much "
+            f"; runs that were never fitted deviate by more than noise and the uncertainty of the prediction allow: {runs} the allowed rms "
             f"(by chance this happens in a share of {off[0].p:.1g} of such campaigns)"
         )
     return text + open_

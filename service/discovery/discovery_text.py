@@ -96,15 +96,15 @@ def _proof_text(judged: Judgement) -> str:
 def _judging_text(gap: GapUm) -> str:
     """Figures of runs that were never fitted. Only these state the closed share of the gap: a fit reduces the residuals of fitted runs."""
     before, after, floor = _gap_values(gap)
-    share = "" if gap.closed is None else f" ({max(gap.closed, 0.0):.0%} closed)"
-    return f"from {before} to {after} µm rms where {floor} µm is noise{share}"
+    share = "" if gap.closed is None else f", {max(gap.closed, 0.0):.0%} closed"
+    return f"from {before} to {after} µm rms (noise alone: {floor} µm{share})"
 
 
 def _left_out_text(finding: Finding) -> str:
     """Tell how far the gap closed on blocks of runs that were left out in turn; empty where holdout runs judge."""
     if finding.left_out is None:
         return ""
-    return f"; on blocks of runs, each left out of the fit once, with names chosen from all readings, {_judging_text(finding.left_out)}"
+    return f"; on blocks of runs left out of the fit in turn, but not of the choice of names, {_judging_text(finding.left_out)}"
 
 
 def _suspect_text(finding: Finding) -> str:
@@ -135,8 +135,8 @@ def _gap_text(finding: Finding) -> str:
     if finding.effects and not entering(finding):
         return f"readings scatter by {before} µm rms, more than the noise of {floor} µm, and no model can remove scatter"
     if not finding.effects:
-        return f"the gap between measured and simulated is {before} µm rms where {floor} µm is noise"
-    return f"in the fitted runs the gap shrinks from {before} to {after} µm rms where {floor} µm is noise"
+        return f"the gap between measured and simulated is {before} µm rms (noise alone: {floor} µm)"
+    return f"in the fitted runs the gap shrinks from {before} to {after} µm rms (noise alone: {floor} µm)"
 
 
 def lines_of(finding: Finding) -> list[str]:
@@ -146,7 +146,7 @@ def lines_of(finding: Finding) -> list[str]:
     for e in finding.effects:
         out += effect_lines(e)
     if finding.confounded_with:
-        out.append("these runs cannot tell it from: " + ", ".join(finding.confounded_with))
+        out.append("these runs cannot tell the named effects from: " + ", ".join(finding.confounded_with))
     return out + changed_lines(finding.changed) + book_lines(finding) + next_of(finding)
 
 
@@ -214,7 +214,7 @@ def next_of(finding: Finding) -> list[str]:
     if finding.verdict == "none":
         again = "measure next: repeat the runs that were never fitted and disagree, some of them with the role identify"
         return ([again] if disagreeing(finding) else []) + unseen_lines(finding)
-    return [f"no available test tells it from {', '.join(finding.confounded_with)}"] if finding.confounded_with else []
+    return [f"no available test tells the named effects from {', '.join(finding.confounded_with)}"] if finding.confounded_with else []
 
 
 def _next_lines(test: NextTest) -> list[str]:

@@ -127,7 +127,7 @@ def _is_helix(runs: list[Run], about: Localization) -> bool:
 
 
 def _repeats_first(runs: list[Run], about: Localization) -> list[Run]:
-    """Return all runs, those to repeat first."""
+    """Return all runs; the runs to repeat come first."""
     return sorted(runs, key=lambda run: run.run_id not in about.runs)
 
 

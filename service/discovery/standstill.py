@@ -97,14 +97,14 @@ def lines_of(answer: StandstillAnswer) -> list[str]:
     found, left = answer.found, answer.found.left_out
     raw, static, lagged = (plain(v * 1e3) for v in (left.raw_mm, left.static_mm, left.response_mm))
     word = "Heat explains it in part" if left.response_mm < GAIN * left.raw_mm else "These temperatures do not explain the displacement"
-    way = "changes since the start of a run" if found.since_start else "temperatures as they are, which tell the state at the start"
+    way = "changes of temperature since the start of a run" if found.since_start else "temperatures as they are"
     time, u_time = (v / 60.0 for v in found.response.time_constant_s)
     out = [
         f"campaign {answer.campaign}: {len(answer.runs)} runs at standstill (ISO 230-3), temperatures {', '.join(answer.sensors)}",
         f"{word}. The displacement since the start of a run is {raw} µm rms. Each run was predicted from all other runs: "
         f"{static} µm rms remain if temperatures act at once, {lagged} µm if they act with a lag.",
         f"U (k = 2) covers {left.covered:.0%} of the readings in these predictions; typical U {plain(2e3 * _typical_u(answer), 2)} µm",
-        f"time constant of the lag {' ± '.join(with_uncertainty(time, u_time))} min; the better model takes {way}",
+        f"time constant of the lag {' ± '.join(with_uncertainty(time, u_time))} min; the model that predicts better uses {way}",
     ]
     out.append("by sensor, all others unchanged:")
     for k, name in enumerate(answer.sensors):
@@ -121,7 +121,7 @@ def lines_of(answer: StandstillAnswer) -> list[str]:
 
 def _shift_lines(answer: StandstillAnswer) -> list[str]:
     better = "look for what changed there (coolant, mounting, sensor)"
-    worse = "this model predicts worse than the other; runs that begin warmer or colder than the rest also look like this"
+    worse = "this model predicts worse than the other; runs that begin warmer or colder than the rest look the same in it"
     found = (
         (answer.found.shift_absolute, "temperatures as they are", worse if answer.found.since_start else better),
         (answer.found.shift_since_start, "changes of temperature", better if answer.found.since_start else worse),
@@ -134,7 +134,7 @@ def _shift_line(runs: Sequence[str], shift: Shift, what: str, then: str) -> str:
     size = " ± ".join(with_uncertainty(shift.size_mm * 1e3, shift.u_mm * 1e3))
     sign = "+" if shift.size_mm > 0.0 else ""
     where = f"from run {runs[shift.first]} " + ("on" if shift.last == len(runs) - 1 else f"to run {runs[shift.last]}")
-    return f"shift: {where} the displacement is {sign}{size} µm off what {what} explain (p = {plain(shift.p, 1)}): {then}"
+    return f"shift: {where} the displacement differs by {sign}{size} µm from what {what} explain (p = {plain(shift.p, 1)}): {then}"
 
 
 def answer_doc(answer: StandstillAnswer) -> dict[str, Any]:

@@ -123,8 +123,8 @@ class ArtefactObject(FileObject):
 class ArtefactSetupObject(FileObject):
     """Position of the artefact, and the sensor that found its points.
 
-    ``tool_radius_mm``: of cutter or stylus, as stated or as a qualification sphere showed it; then ``u_tool_radius_mm`` is its standard
-    uncertainty.
+    ``tool_radius_mm``: radius of cutter or stylus, stated or measured on a qualification sphere; ``u_tool_radius_mm``: standard uncertainty
+    of a measured radius.
     """
 
     setup_id: str

@@ -58,10 +58,10 @@ class AlarmFacts:
     """Facts of an entry of an alarm. Facts that its kind lacks keep their defaults; ``text``: a sentence for people.
 
     Of a check: ``recipe``, ``schedule``, its number ``verification``, and its ``signals``. Of a person: ``name``, ``comment`` or
-    ``reason``, and the end of a shelving, ``until_utc``. Of an investigation: its ``campaign``, its ``discovery``, the reasons
-    ``against`` tables (empty: none), the unexplained readings beyond noise ``rms_um``, ``unnamed`` (something is missing, and no effect
-    was found for it), its ``proposal``, the ``code`` of a refusal, the ``cause`` of a failure. Of a push: ``proposal``, ``approval``,
-    the number of the push before it, ``after``, and its outcome ``word`` as in `JobOutcome`.
+    ``reason``, and the end of a shelving, ``until_utc``. Of an investigation: its ``campaign``, its ``discovery``, the reasons ``against``
+    tables (empty: none), ``rms_um`` (rms of what the model leaves beyond noise), ``unnamed`` (something is missing, and no effect was found
+    for it), its ``proposal``, the ``code`` of a refusal, the ``cause`` of a failure. Of a push: ``proposal``, ``approval``, the number of
+    the push before it, ``after``, and its outcome ``word`` as in `JobOutcome`.
     """
 
     text: str = ""

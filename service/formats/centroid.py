@@ -3,8 +3,8 @@
 Five lines of heading (version, axis, units, interval, number of entries), then a line per point: position, correction while moving in +,
 correction while moving in −, separated by tabs. The first point is the reference; the others follow away from it. Sources: cncsnw.com,
 "Laser Compensation" (versions, file names, both directions), and a control's own file of zeros (github.com/teno1608/PLC-CNC-lathe-machine,
-cnc-x.tab). Neither states the unit of a correction (taken: that of the heading), its sign, or which of the two columns is which: verify the
-10 µm step first, in both directions (docs/reference/formats.md). Version 1 (CNC7 up to v7.17) is neither written nor read.
+cnc-x.tab). Neither states the unit of a correction (this module takes the unit of the heading), its sign, or which column is which: verify
+the 10 µm step first, in both directions (docs/reference/formats.md). Version 1 (CNC7 up to v7.17) is neither written nor read.
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Heidenhain KinematicsComp: all 18 error motions of X, Y and Z, with squareness, in columns C1 to C6 of the axes' .COM files.
 
-Columns by the scheme that HEIDENHAIN recommends (iTNC 530 HSCI manual p. 680): C1 to C6 are EXX EYX EZX EAX EBX ECX of X, the same of Y
-and Z. The control's kinematics description places them before the axis that they affect (pp. 670 to 686: column COMPTAB, at most 100
+Columns by the scheme that HEIDENHAIN recommends (iTNC 530 HSCI manual p. 680): C1 to C6 are EXX EYX EZX EAX EBX ECX for X, and likewise
+for Y and Z. The control's kinematics description places them before the axis that they affect (pp. 670 to 686: column COMPTAB, at most 100
 entries); the machine's builder enters this order. Squareness stands in the straightness of the axis that is out of square, as a straight
 line; the control then needs no entry for it. Errors are written as measured, mm and degrees. The manual's pages that could be read state
 neither the sign nor the unit of the angles: verify the 10 µm step first, also at an angle (docs/reference/formats.md). Lost motion goes

@@ -98,7 +98,7 @@ def test_an_instrument_error_that_this_campaign_cannot_show_is_not_named(tmp_pat
     assert found.anew.gap.before_um < NEAR * found.anew.gap.floor_um, said
     assert book(tmp_path / "kept") == []
     assert not judged(found)[0]  # it is there all the same, and the story says so
-    assert "hidden was laser_cosine" in said
+    assert "hidden effect was laser_cosine" in said
 
 
 def seed_of(name):

@@ -304,7 +304,7 @@ GAP = {"before_um": 10.0, "after_um": 1.0, "floor_um": 1.0}
         ({}, {"u": 7.0}, False, "zero is within its uncertainty"),
         ({"hidden_um_m": {"EYY": 3.2}}, {}, True, "at most (k = 2): scale of Y 3.2 µm/m"),
         ({}, {}, True, "not seen by these runs: scale of Y, scale of Z"),
-        ({"gap": GAP | {"after_um": 12.0}}, {}, False, "the gap goes from 10.0 to 12.0 µm rms where 1.00 µm is noise"),
+        ({"gap": GAP | {"after_um": 12.0}}, {}, False, "the gap goes from 10.0 to 12.0 µm rms (noise alone: 1.00 µm)"),
     ],
 )
 def test_a_change_that_is_not_proved_says_so(told: Doc, change: Doc, proof: bool, says: str) -> None:

@@ -227,7 +227,7 @@ def changed(search: Search, **changes: Any) -> Any:
             (),
             "open",
             "the fitted runs to their noise; runs that were never fitted deviate by more than noise and the uncertainty of the prediction "
-            "allow: r03 1.8 times as much (by chance",
+            "allow: r03 1.8 times the allowed rms (by chance",
         ),
         ((Agreement("r03", 1.12, 0.03),), (), "ok", "explains all runs to their noise"),
         ((), (Unjudged("r03", "nobody knows"),), "ok", "explains the fitted runs to their noise; not judged, for nobody knows: r03"),
