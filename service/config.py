@@ -99,7 +99,7 @@ def _with_files(machine: MachineFile, folder: Path) -> MachineFile:
 
 
 def _check_exclusive(path: Path, values: Mapping[str, Any]) -> None:
-    """Refuse a list entry with keys of both its forms, even if a value equals its default: the intended form would be ambiguous."""
+    """Refuse an entry of a list that mixes the keys of its two forms (`EXCLUSIVE_KEYS`), even if a value equals its default."""
     for name, (one, other) in EXCLUSIVE_KEYS.items():
         for number, entry in enumerate(values.get(name, ()), start=1):
             found, more = [key for key in one if key in entry], [key for key in other if key in entry]
@@ -164,7 +164,7 @@ def _overrides() -> dict[str, Any]:
 
 
 def _place(parts: list[str]) -> list[str]:
-    """Return the keys of a variable, spelled as in the file; keys that are not in the file, in small letters."""
+    """Return the keys that a variable names, spelled as in the file; unknown keys become small letters."""
     place, keys = [], _keys(MachineFile)
     for part in parts:
         place.append(next((key for key in keys if key.upper() == part), part.lower()))

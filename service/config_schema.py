@@ -167,7 +167,7 @@ class Limits(ConfigTable):
     continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
         default_factory=list,
         description="conditions that only suspend a measurement, which resumes by itself when they have cleared; e-stop and alarm always "
-        "end it. ballbar: its box lost the connection or restarted, until it answers again",
+        "end it. Condition ballbar: the box of the ball-bar lost its connection or restarted; it clears when the box answers again",
     )
     suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension; after it the run ends")
     settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
@@ -211,7 +211,8 @@ class Material(ConfigTable):
         description="expansion coefficient of each axis' scale (without a scale: of its screw), 1/K, e.g. {X = 11.5e-6}",
     )
     u_scale_per_k: AxisUncertainties = Field(
-        default=AxisUncertainties(), description="its standard uncertainty, 1/K, for each axis with a coefficient, e.g. {X = 0.6e-6}"
+        default=AxisUncertainties(),
+        description="standard uncertainty of scale_per_k, 1/K, for each axis with a coefficient, e.g. {X = 0.6e-6}",
     )
     temperature_c: Annotated[float, Field(ge=COLDEST_C, le=WARMEST_C)] | None = Field(
         default=None, description="temperature of the scales, for runs that did not record it for their axis (temp_x_C, temp_y_C, temp_z_C)"
@@ -229,7 +230,7 @@ class Material(ConfigTable):
         description="expansion coefficient of the workpieces, 1/K: reports then also show the deviations at 20 °C of a part that was made "
         "at the temperature of the scales",
     )
-    u_workpiece_per_k: CoefficientUncertainty | None = Field(default=None, description="its standard uncertainty, 1/K")
+    u_workpiece_per_k: CoefficientUncertainty | None = Field(default=None, description="standard uncertainty of workpiece_per_k, 1/K")
 
     @model_validator(mode="after")
     def _known(self) -> Self:
@@ -259,17 +260,19 @@ class Material(ConfigTable):
 class Calibration(ConfigTable):
     """Last days of the instruments' certificates. No table is written from an instrument without a valid certificate."""
 
-    ballbar: Certificate = Field(default=None, description="of the ball-bar, e.g. 2027-05-31")
-    laser: Certificate = Field(default=None, description="of the laser")
+    ballbar: Certificate = Field(default=None, description="last day of the ball-bar's certificate, e.g. 2027-05-31")
+    laser: Certificate = Field(default=None, description="last day of the laser's certificate")
     ballbar_is: str = Field(
         default="", max_length=400, description="maker, model and serial of the ball-bar; number and laboratory of its certificate"
     )
-    laser_is: str = Field(default="", max_length=400, description="the same for the laser")
+    laser_is: str = Field(default="", max_length=400, description="the same facts for the laser")
     artefact: Certificate = Field(
-        default=None, description="of the probed artefact's length; without a calibrated length, of the touch probe's test (ISO 230-10)"
+        default=None,
+        description="last day of the certificate of the artefact's length; without a calibrated length: of the touch probe's test (ISO "
+        "230-10)",
     )
-    artefact_is: str = Field(default="", max_length=400, description="the same for the artefact")
-    room: Certificate = Field(default=None, description="of room_temperature_c: last day for which somebody confirmed it")
+    artefact_is: str = Field(default="", max_length=400, description="the same facts for the artefact")
+    room: Certificate = Field(default=None, description="last day for which somebody confirmed room_temperature_c")
     room_temperature_c: Temperatures | None = Field(
         default=None,
         description="lowest and highest air temperature by the room's own thermometer, at most 1 K apart; only for a machine without a "
@@ -302,7 +305,7 @@ class Nc(ConfigTable):
     """The controller that NC programs are written for (`abbe measure --nc`)."""
 
     acceleration_mm_s2: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(
-        default=500.0, description="along the path; used only to estimate how long a program runs"
+        default=500.0, description="acceleration along the path; used only to estimate how long a program runs"
     )
     heidenhain_tool: Annotated[int, Field(ge=1, le=32_767)] | None = Field(
         default=None, description="row of the tool table for the tool in the spindle (length 0, radius 0); absent: the operator enters it"
@@ -397,7 +400,7 @@ class Web(ConfigTable):
 class OpcUa(ConfigTable):
     """A read-only OPC UA server that shows the machine to the plant."""
 
-    enabled: bool = Field(default=False, description="needs the extra: pip install 'abbe[opcua]'")
+    enabled: bool = Field(default=False, description="whether the server runs; it needs the optional packages: pip install 'abbe[opcua]'")
     host: str = Field(
         default="127.0.0.1",
         min_length=1,

@@ -72,10 +72,11 @@ LOOSER: Mapping[str, Looser] = MappingProxyType(
         "schedule.name": "stated",
     }
 )
-"""Changes of a value that allow more than before. ``more``, ``less``: a larger, a smaller value; ``higher``: a larger value, or none any
-more; ``wider``: a range that is not inside the old one, or no range any more; ``added``: further entries; ``later``: a later day, or the
-first; ``stated``: any stated value; ``changed``: another value; ``raised``: another value, except those of `UNRAISED`; ``dropped``: another
-value, unless the old one was ``any``. Of a new schedule only the name is judged, of a removed schedule nothing."""
+"""Which new value of a key allows more than the old one. ``more``: a larger value; ``less``: a smaller one; ``higher``: a larger one, or
+none; ``wider``: a range that is not inside the old one, or none; ``added``: a list with further entries; ``later``: a later day, or the
+first; ``stated``: any value, but not none; ``changed``: any other value; ``raised``: any other value that is not in `UNRAISED`;
+``dropped``: any other value, if the old one was not ``any``. Of a new schedule only the name is judged; a removed schedule allows no more
+than before."""
 UNRAISED = ("skip", "none")
 _IS_LOOSER: Mapping[Looser, Callable[[Any, Any], bool]] = MappingProxyType(
     {
@@ -104,7 +105,7 @@ class ValueChange:
     looser: bool
 
     def __str__(self) -> str:
-        """The change in one phrase, e.g. ``verify.helix_rms_um 5.0 -> 6.0``."""
+        """The change in one phrase, e.g. ``verify.helix_rms_um 5.0 → 6.0``."""
         return f"{self.key} {_shown(self.old)} → {_shown(self.new)}"
 
 

@@ -43,7 +43,7 @@ class _Statement:
         return self.at[:n] == path if self.header else any(leaf[:n] == path for leaf in self.leaves())
 
     def leaves(self) -> Iterator[Path]:
-        """The keys whose values it has."""
+        """The keys to which the statement gives values."""
         return iter(()) if self.header else (path for path, _ in _leaves(self.values, self.at))
 
 
@@ -93,7 +93,7 @@ def _put(inside: Any, path: Path, value: Any) -> None:
 
 
 def edited(text: str, key: str, value: Any) -> str:
-    """Return a TOML text with the value of one key replaced, added or, for None, removed; a table is removed by its own key.
+    """Return a TOML text with the value of one key replaced or added. None removes the key; the key of a table removes the whole table.
 
     The result is parsed and compared: it differs in this value alone.
 
@@ -114,7 +114,7 @@ def edited(text: str, key: str, value: Any) -> str:
 
 
 def _full(values: Any) -> Any:
-    """Parsed TOML as JSON has it, dates as texts, without empty tables."""
+    """Return parsed TOML as JSON values: dates become texts, and empty tables are left out."""
     if isinstance(values, dict):
         return {key: _full(one) for key, one in values.items() if one != {}}
     return json.loads(json.dumps([_full(one) for one in values] if isinstance(values, list) else values, default=str))
@@ -166,7 +166,7 @@ def _joined(lines: list[_Statement], k: int, new: str) -> str:
 
 
 def _depth(one: _Statement) -> tuple[Path, Any]:
-    """The keys on the left of a statement, and the value on its right."""
+    """Return the keys on the left side of a statement, and the value on its right side."""
     left = _LEFT.match(one.text)
     assert left is not None
     names: list[str | int] = []
@@ -180,7 +180,7 @@ def _depth(one: _Statement) -> tuple[Path, Any]:
 
 
 def _written(statement: str, value: Any) -> str:
-    """A statement with another value; its comments stay, those inside a long value above it."""
+    """Return a statement with another value. Its comments stay; comments between the lines of a long value move above it."""
     left = _LEFT.match(statement)
     assert left is not None
     found = [token[0] for token in _TOKEN.finditer(statement, left.end()) if token[0].startswith("#")]
@@ -207,7 +207,7 @@ def _name(part: str | int) -> str:
 
 
 def _statements(text: str) -> list[_Statement]:
-    """All statements of a TOML text, in order; joined by ends of lines they are the text again."""
+    """Return all statements of a TOML text, in order; joined by line feeds they give the text again."""
     found: list[_Statement] = []
     tables: dict[Path, int] = {}  # how many tables of a list there are so far
     at: Path = ()

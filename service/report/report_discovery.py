@@ -42,14 +42,14 @@ AXES = "XYZ"
 CELLS = 24
 """Cells of the map along the longer side of the measured area."""
 FEWEST = 3
-"""Fewest readings of a cell."""
+"""A cell with fewer readings is not drawn."""
 REJECTED = 40
 DECIDED = "How it was decided"
 SIGNS: dict[str, Sign] = {"ok": "ok", "open": "open", "bad": "bad"}
 STATEMENTS = (
     "U of a named effect is from a fit of the effect together with all other parameters that these runs leave free.",
-    "Gap: measured minus simulated; deviation = actual − nominal, tool relative to workpiece (ISO 230-1). Runs by role: identify, fitted; "
-    "holdout, never fitted and used to judge only; sealed, predicted without knowledge of the readings.",
+    "Gap: measured minus simulated; deviation = actual − nominal, tool relative to workpiece (ISO 230-1). Roles of runs: identify is "
+    "fitted; holdout is never fitted, and only judges; sealed is predicted without knowledge of the readings.",
 )
 
 
@@ -183,7 +183,7 @@ def _card(effect: EffectFound) -> dict[str, str]:
     out |= ({"Where": there} if there else {}) | {"How it looks": effect.signature, "What else it could be": "; ".join(rival_lines(effect))}
     out |= {"Look at the data": effect.sensor_doubt} if effect.sensor_doubt else {}
     out |= {name.replace("_", " ").capitalize(): parameter_text(p) for name, p in effect.parameters.items()}
-    out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much likelier the effect makes the readings, less its penalty)"
+    out["Evidence"] = f"{plain(effect.evidence)} (natural logarithm of how much likelier the effect makes the readings, less a penalty)"
     if effect.forms:
         out["Form"] = "differs from the textbook's: " + ", ".join(effect.forms)
     return out | {"Source": effect.source}
@@ -192,7 +192,7 @@ def _card(effect: EffectFound) -> dict[str, str]:
 def gap_table(finding: Finding) -> TextTable:
     """Return the table of the gap (measured minus simulated), one row per role of runs.
 
-    Fitted runs get no closed share, because a fit makes their residuals smaller than those of new runs.
+    Fitted runs have no entry under "Gap closed": the fit makes their residuals smaller than those of new runs.
     Sealed runs are only counted: their readings are unknown here.
     """
     only_scatter = bool(finding.effects) and not entering(finding)  # explained scatter closes no gap

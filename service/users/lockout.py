@@ -46,7 +46,7 @@ class _Count:
     until_s: float = 0.0
     last_s: float = 0.0
     before: tuple[float, float] = (0.0, 0.0)
-    """``until_s`` and ``last_s`` before the last attempt."""
+    """Values of ``until_s`` and ``last_s`` before the last attempt; a successful attempt restores them for its address."""
 
 
 class Lockout:
@@ -54,7 +54,7 @@ class Lockout:
 
     Each known place of an account (a browser or address of an earlier login, the service's own computer) counts on its own: guesses from
     elsewhere do not delay logins there. All other places of an account also share one count, so that new addresses give no additional
-    guesses. A known browser does not even wait for its own address, which all may share behind a proxy.
+    guesses. A known browser does not wait for failures at its address either, since all visitors may share one address behind a proxy.
 
     Parameters
     ----------
