@@ -52,7 +52,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _begun(_phase: str, _info: dict[str, int]) -> None:
-    """Collect garbage as `abbe.service.children` does from the first collection on: then a command works, and no longer imports."""
+    """Set the collector's threshold of `abbe.service.children` at the first collection: by then imports are over and the command works."""
     gc.callbacks.remove(_begun)
     gc.set_threshold(50_000)
 
@@ -99,7 +99,7 @@ def run(arguments: Sequence[str] | None = None) -> int:
 def named_by(app: Typer, words: Sequence[str]) -> Typer:
     """Return the tree with only the command or group that the first word names; the whole tree if the word names none.
 
-    Reading the options of the sixty others takes a tenth of the time of a short command.
+    Building the options of the other sixty commands would take a tenth of the time of a short command.
     """
     first = words[0] if words else ""
     own = [one for one in app.registered_commands if one.name == first]

@@ -307,7 +307,8 @@ def _with_out(work: Any) -> Any:
 
 
 class _WithOut:
-    """A command with ``--out FILE``. Its signature is computed when it is asked for: that of sixty others would be a tenth of the help."""
+    """A command with ``--out FILE``. Its signature is computed on demand: for all sixty commands that would take a tenth of the time of
+    ``--help``."""
 
     def __init__(self, work: Any) -> None:
         functools.update_wrapper(self, work)

@@ -134,7 +134,7 @@ CHECKS = ("quick-check", "verification")
 
 
 def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_s: float) -> tuple[dict[str, Any], str]:
-    """Judge the measured runs and store them as a check that began with its campaign; return it for programs, and as a line."""
+    """Judge the measured runs and store them as a check that began with its campaign; return the check as JSON object and as one line."""
     from datetime import datetime
 
     from abbe.service.clock import SystemClock

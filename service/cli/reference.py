@@ -41,7 +41,7 @@ PARTS: dict[Source, tuple[str, str]] = {
 
 LEGEND = (
     "reproduced: computed from independent inputs, and equal to the last printed digit; consistent: off by no more than rounded inputs"
-    " allow (within), or a bound that holds; input: given, nothing to compute; not reproducible: the paper does not give the inputs"
+    " allow (column within), or a bound that holds; input: given, nothing to compute; not reproducible: the paper does not give the inputs"
 )
 
 

@@ -29,7 +29,7 @@ class Printed:
     last : str, optional
         Unit of the last digit if the text does not show it: ``"0.1"`` for a ``"0"`` in a column of tenths.
     digits, padding : int and str, optional
-        Number of significant digits if the zeros after them are padding, and the reason. As an assumption, it never makes a number
+        Number of significant digits if the zeros after them are padding, and the reason. Padding is an assumption: it never makes a number
         reproduced.
     """
 

@@ -10,7 +10,7 @@ from abbe.service.rendering.document import Document, ReportFigure
 from abbe.service.rendering.numbers import COVERAGE, finite, tidy
 
 VALID, INVALID = 0, 255
-"""Attribute K0002 of a value."""
+"""Attribute K0002 of a valid and of an invalid value."""
 
 
 def document_dfq(document: Document) -> bytes:

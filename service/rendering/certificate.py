@@ -198,7 +198,8 @@ def _real(value: float, u: float | None, figure: ReportFigure) -> ET.Element:
 
 
 def _conformity(document: Document, figure: ReportFigure) -> ET.Element:
-    """Return the conformity by the decision rule. If the measurement cannot decide, conformity is conditional, by the value alone."""
+    """Return the conformity by the decision rule. If the measurement cannot decide, the value alone decides, and the status is
+    conditional."""
     assert figure.value is not None
     assert figure.limit is not None
     inside = "conditionalPass" if abs(figure.value) <= figure.limit else "conditionalFail"

@@ -17,8 +17,8 @@ Kind = Literal["run", "campaign", "verification", "discovery", "push", "simulati
 Sign = Literal["ok", "open", "bad"]
 
 DECISION_RULE = (
-    "ISO 14253-1, guard band U on both sides of a limit: within limits is stated where value + U does not exceed the limit, out of limits "
-    "where value - U exceeds it; in between the measurement cannot tell. A figure without a limit is reported and not judged."
+    "ISO 14253-1, guard band U on both sides of a limit: a figure is within limits if value + U does not exceed the limit, out of limits "
+    "if value - U exceeds it; in between the measurement cannot tell. A figure without a limit is reported and not judged."
 )
 UNCERTAINTY = (
     f"U is the expanded uncertainty, k = {COVERAGE:g}, about 95 % coverage for a normal distribution (GUM); value and U are rounded "

@@ -129,7 +129,7 @@ NAMES = frozenset(("Machine", "Campaign", "Run", "File", "Authorised by", "Appro
 
 def shown(document: Document, draw: Callable[[str], str] = str) -> dict[str, Any]:
     """Data for a template, in the document's language: text, numbers rounded with their uncertainty, and pictures as ``draw`` converts
-    their SVG. The digest of a certificate is that of the English report, and the same in every language."""
+    their SVG. The digest of a certificate is computed from the English report: it is the same in every language."""
 
     def picture(svg: str) -> str:
         return draw(pictured(document.lang, svg))

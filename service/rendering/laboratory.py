@@ -88,5 +88,5 @@ def _traceable(document: Document) -> str:
         return "Metrological traceability is not stated: not every instrument is identified with its certificate."
     text = "The results are traceable to the SI through the certificates of the instruments listed under Instruments"
     if any("not calibrated" in one.known for one in document.instruments):
-        return f"{text}, except results that rest on a length that is not calibrated there."
+        return f"{text}, except results that rest on a length listed as not calibrated."
     return f"{text}."

@@ -1,9 +1,9 @@
 """Translate English sentences (stored verdicts and remarks, reports, pictures) to the reader's language.
 
-A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". A text that stands
-for a name in braces is translated by the same rules, unless `NAMED` has this name. Such a text never contains the end of a sentence, and
-no blanks if its name has one letter. A phrase has no full stop at its end. A text without a pattern is split into sentences and their
-parts, and each part is tried; a part without a pattern stays English. Tests search all screens and reports for texts without a pattern.
+A file of the folder ``phrases`` maps English patterns to patterns in each language: ``"{n} runs"`` fits "17 runs". The text in the place of
+a name in braces is translated by the same rules, unless the name is in `NAMED`. This text never contains the end of a sentence, and no
+blanks if the name has one letter. A phrase has no full stop at its end. A text without a pattern is split into sentences and their parts,
+and each part is tried; a part without a pattern stays English. Tests search all screens and reports for texts without a pattern.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ class _Pattern:
 
 @cache
 def _phrases(lang: str) -> tuple[dict[str, str], tuple[_Pattern, ...]]:
-    """Phrases without places, and patterns of those with some, the most literal first."""
+    """Phrases without places, and patterns for phrases with places, the most literal first."""
     known: dict[str, str] = {}
     for file in sorted(FOLDER.glob("*.json")):
         known |= {key: told[lang] for key, told in json.loads(file.read_text(encoding="utf-8")).items() if lang in told}

@@ -64,7 +64,7 @@ class Svg:
             self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="{_attr(style)}"{_close("rect", tip)}')
 
     def link(self, corner: XY, size: XY, href: str) -> None:
-        """Invisible area whose click a script of the page turns into a link to ``href``; keyboard users find links beside the picture."""
+        """Invisible area; a script of the page opens ``href`` on a click. Keyboard users find links beside the picture."""
         (x, y), (w, h) = _pair(corner), _pair(size)
         self._body.append(f'<rect x="{x}" y="{y}" width="{w}" height="{h}" class="leads" fill-opacity="0" data-href="{_attr(href)}"/>')
 

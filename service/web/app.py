@@ -90,7 +90,7 @@ def as_in_host_header(host: str) -> str:
 
 
 class Application(FastAPI):
-    """FastAPI with the security headers outermost, so that every response has them, even that to an unhandled error."""
+    """FastAPI with the security headers outermost, so that every response has them, even the response to an unhandled error."""
 
     behind_tls = False
     status: Callable[[], Awaitable[Status]] | None = None

@@ -19,7 +19,7 @@ MOST_FIELDS = 8
 
 
 async def form_of(request: Request, most: int = MOST_FIELDS, *, blank: bool = False) -> dict[str, str] | None:
-    """Fields of a form, with ``blank`` the empty ones too; None: more than ``most`` fields, or the client disconnected."""
+    """Fields of a form; with ``blank`` also the empty ones. None: more than ``most`` fields, or the client disconnected."""
     try:
         text = (await request.body()).decode("utf-8", "replace")
         return {key: values[0] for key, values in parse_qs(text, blank, max_num_fields=most).items()}

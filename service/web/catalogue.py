@@ -18,7 +18,7 @@ DEFECT = "ABB-001"
 HTTP: dict[int, tuple[str, str]] = {
     400: ("WEB-400", "The request is unreadable: no JSON, a missing or wrong header, or a foreign Host."),
     401: ("WEB-401", "No user is logged in, or the token is no longer valid."),
-    403: ("WEB-403", "The role does not allow it, or the request comes from a foreign page."),
+    403: ("WEB-403", "The user's role does not allow the request, or the request comes from a foreign page."),
     404: ("WEB-404", "There is no such path, or the number is impossible."),
     405: ("WEB-405", "The path has other methods; the header Allow lists them."),
     409: ("WEB-409", "The request contradicts the stored data."),

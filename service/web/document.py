@@ -77,7 +77,12 @@ def complete(document: Doc, routes: Sequence[BaseRoute]) -> Doc:
     schemas["Problem"] = Problem.model_json_schema()
     document["components"]["securitySchemes"] = {
         "token": {"type": "http", "scheme": "bearer", "description": "abbe user token new"},
-        "session": {"type": "apiKey", "in": "cookie", "name": COOKIE, "description": "of POST /login; changes need X-CSRF-Token too"},
+        "session": {
+            "type": "apiKey",
+            "in": "cookie",
+            "name": COOKIE,
+            "description": "cookie from POST /login; changes need X-CSRF-Token too",
+        },
     }
     return document
 

@@ -13,7 +13,7 @@ _SPAN = re.compile(r"`?" + _NAME + r"[^`;,。]*`?")
 _ASIDE = re.compile(r" ?[(（][^()（）]*" + _NAME + r"[^()（）]*[)）]")
 _PARTS = re.compile(r"((?<=[;.]) |(?<=。))")
 _MOST_WORDS = 4
-"""A part of a text with more words than this besides its command has other content, too, and is kept."""
+"""A part of a text that has more words than this beside its command says more than the command, and is kept."""
 
 
 def stamp(time: datetime, zone: tzinfo = UTC) -> str:
@@ -31,7 +31,7 @@ def figure_name(key: str) -> tuple[str, str]:
 
 
 def number(value: float | None) -> str:
-    """A value with two decimals below 1, one below 100, none from there on; a dash for None."""
+    """A value with two decimals below 1, one below 100, and none from 100 on; a dash for None."""
     if value is None:
         return "–"
     size = abs(value)

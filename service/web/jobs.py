@@ -27,7 +27,7 @@ NUMBER = Path(pattern="^[0-9a-f]{12}$", description="Number of the job")
 PROMPT = Path(ge=1, le=10**6, description="Number of the prompt, from the state of the job")
 REFUSALS: dict[int | str, dict[str, object]] = {
     401: {"model": Problem, "description": "No user is logged in"},
-    403: {"model": Problem, "description": "The role does not allow it"},
+    403: {"model": Problem, "description": "The user's role does not allow the request"},
     404: {"model": Problem, "description": "There is no such job"},
     409: {"model": Problem, "description": "The machine is in use; or the job has ended, cannot pause, or waits for another answer"},
     422: {"model": Problem, "description": "There is no such recipe, or the request is not well-formed"},
@@ -55,8 +55,8 @@ def add_jobs(app: FastAPI, core: CoreLine, recipes: tuple[str, ...], campaigns: 
     ) -> Response:
         """Run a recipe now; ``identification``, the full campaign, ends with a proposal and also needs the permission ``propose``.
 
-        With ``alarm`` the full campaign also looks for the cause of that alarm: it resumes after the last finished step or, if there is
-        an answer, starts anew. With ``resume`` it keeps the complete runs of an interrupted campaign.
+        With ``alarm`` the full campaign also looks for the cause of that alarm: it resumes after the last finished step, or starts anew if
+        an earlier search has found an answer. With ``resume`` it keeps the complete runs of an interrupted campaign.
         """
         visit: Visit = request.state.visit
         recipe = named(wanted.recipe, wanted.rate_hz)
@@ -138,7 +138,7 @@ def answered(core: CoreLine, answer: Answer) -> Response:
 
 
 def _find(core: CoreLine, number: str) -> JobState | None:
-    """The job, its sentences in the reader's language."""
+    """Return the job with its sentences in the reader's language."""
     found, lang = next((job for job in core.jobs() if job.id == number), None), current().lang
     if found is None:
         return None

@@ -71,7 +71,7 @@ def _of_core(snapshot: Snapshot) -> Iterator[Metric]:
         devices.add_metric([device.role], float(device.state in {"in use", "answered"}))
     yield devices
     yield GaugeMetricFamily("abbe_measuring", "Whether a check runs", float(snapshot.check is not None))
-    yield GaugeMetricFamily("abbe_mqtt_connected", "Whether the broker is there", float(snapshot.mqtt_connected))
+    yield GaugeMetricFamily("abbe_mqtt_connected", "Whether the broker is connected", float(snapshot.mqtt_connected))
     yield GaugeMetricFamily("abbe_attention", "How many things need a person", len(snapshot.attention))
     yield GaugeMetricFamily("abbe_core_resident_memory_bytes", "Resident memory of the core process", snapshot.core_rss_bytes)
     yield CounterMetricFamily("abbe_web_restarts", "How often the web process was started again", snapshot.web_restarts)

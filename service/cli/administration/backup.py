@@ -18,7 +18,8 @@ def backup(
     target: Annotated[Path, typer.Argument(metavar="TARGET", help="New folder.", show_default=False)],
     without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
     share: Annotated[
-        bool, typer.Option("--share", help="Write only what the latest such backup in the same folder lacks; each stays complete.")
+        bool,
+        typer.Option("--share", help="Write only what the latest shared backup in the same folder lacks; every backup stays complete."),
     ] = False,
     db: DbOption = None,
     machine: MachineOption = None,

@@ -96,7 +96,7 @@ def trend(
         typer.Option(
             "--after",
             metavar="UTC",
-            help="Only checks after this time, e.g. of a repair; default: of the last kept push.",
+            help="Only checks after this time, e.g. after a repair; default: after the last kept push.",
             show_default=False,
         ),
     ] = None,

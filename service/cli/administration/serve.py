@@ -35,7 +35,8 @@ if TYPE_CHECKING:
 
 
 LONGEST_NAME = 180
-"""Longest name, in characters, of a recipe that a person may start: messages to the page hold 200, and the rate is appended to it."""
+"""Longest name, in characters, of a recipe that a person may start: a message to the page holds 200, and the rate is appended to the
+name."""
 
 
 def serve(

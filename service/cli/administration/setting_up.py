@@ -34,16 +34,20 @@ def init(  # noqa: PLR0913 - one option for each question
     tool: Annotated[
         str | None, typer.Option("--tool", help="Vector from the spindle's reference point to the ball, mm: 0,0,-120.", show_default=False)
     ] = None,
-    cnc: Annotated[str | None, typer.Option("--cnc", metavar="URL", help="Address of the controller; none: -.", show_default=False)] = None,
-    ballbar: Annotated[
-        str | None, typer.Option("--ballbar", metavar="URL", help="Address of the ball-bar; none: -.", show_default=False)
+    cnc: Annotated[
+        str | None, typer.Option("--cnc", metavar="URL", help="Address of the controller, or - for none.", show_default=False)
     ] = None,
-    laser: Annotated[str | None, typer.Option("--laser", metavar="URL", help="Address of the laser; none: -.", show_default=False)] = None,
+    ballbar: Annotated[
+        str | None, typer.Option("--ballbar", metavar="URL", help="Address of the ball-bar, or - for none.", show_default=False)
+    ] = None,
+    laser: Annotated[
+        str | None, typer.Option("--laser", metavar="URL", help="Address of the laser, or - for none.", show_default=False)
+    ] = None,
     certificates: Annotated[
         str | None,
         typer.Option(
             "--certificates",
-            help="Last days of the certificates of ball-bar and laser: 2027-05-31,2027-05-31; none: -.",
+            help="Last days of the certificates of ball-bar and laser: 2027-05-31,2027-05-31, or - for none.",
             show_default=False,
         ),
     ] = None,

@@ -38,7 +38,8 @@ def version(as_json: JsonOption = False) -> None:
 def sim(
     context: typer.Context,
     file: Annotated[
-        Path | None, typer.Option("--machine-file", metavar="FILE", help="Write a machine file for it.", show_default=False)
+        Path | None,
+        typer.Option("--machine-file", metavar="FILE", help="Write a machine file for the simulated machine.", show_default=False),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:
@@ -52,7 +53,7 @@ def sim(
     own_group: dict[str, Any] = {"process_group": 0} if os.name == "posix" else {}
     arguments = list(context.args)
     if {"-h", "--help"} & set(arguments):
-        typer.echo("abbe sim [--machine-file FILE] ...: FILE is a new machine file for it; the other options:", err=True)
+        typer.echo("abbe sim [--machine-file FILE] ...: FILE is a new machine file for the simulated machine; the other options:", err=True)
     if file is not None and file.exists():
         raise ConfigError(f"{file} exists", "remove it, or give another name")
     if arguments[:1] != ["truth"] and "--watch-stdin" not in arguments:

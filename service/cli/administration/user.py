@@ -99,7 +99,7 @@ def enable_user(name: Name, db: DbOption = None, machine: MachineOption = None, 
 def new_token(
     name: Name,
     title: Annotated[str, typer.Argument(metavar="TOKEN", help="Name of the token.", show_default=False)],
-    scope: Annotated[list[str], typer.Option("--scope", help="A right of the token, one of the user's; may be repeated.")],
+    scope: Annotated[list[str], typer.Option("--scope", help="A right for the token, which the user must have; may be repeated.")],
     days: Annotated[float, typer.Option("--days", help="How long the token is valid, days.")] = 90.0,
     db: DbOption = None,
     machine: MachineOption = None,
@@ -163,7 +163,7 @@ def _people(db: str | None, machine: Path | None, *, must_exist: bool = True) ->
 
 
 def _password() -> str:
-    """Read a password: typed twice and hidden at a terminal, else the first line of stdin. Other users could see it as an argument."""
+    """Read a password: typed twice and hidden at a terminal, else the first line of stdin. An argument would be visible to other users."""
     from abbe.service.errors import PasswordRefused
 
     if not sys.stdin.isatty():

@@ -50,9 +50,9 @@ def discover(  # noqa: PLR0913 - one argument for each option
     """Find where measurement and simulation disagree, and name the missing effect: its size, the remedy, alternatives, the next experiment.
 
     Runs with the role identify are fitted, runs with the role holdout only judge the fit, and sealed runs are predicted. A folder's
-    result is stored only if --db or -m names a database. After Ctrl-C the same command resumes. Instead, runs at standstill with
-    temperatures show the thermal response (ISO 230-3), and points of artefacts show which errors move with the part and which belong to
-    the machine; neither result is stored.
+    result is stored only if --db or -m names a database. After Ctrl-C the same command resumes. Two kinds of runs need no search: runs at
+    standstill with temperatures show the thermal response (ISO 230-3), and points of artefacts show which errors move with the part and
+    which belong to the machine. Neither result is stored.
     """
     check_endings(report)
     if live:

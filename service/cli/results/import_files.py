@@ -44,13 +44,19 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     columns: Annotated[
         Path | None, typer.Option("--columns", metavar="FILE", help="Description of a table's columns (TOML).", show_default=False)
     ] = None,
-    axis: Annotated[str | None, typer.Option("--axis", help="X, Y or Z, for a file that does not say it.", show_default=False)] = None,
+    axis: Annotated[
+        str | None, typer.Option("--axis", help="Measured axis, for a file that does not state it: X, Y or Z.", show_default=False)
+    ] = None,
     unit: Annotated[
-        str | None, typer.Option("--unit", help="Unit of the readings, for a file that does not say it: mm, um ...", show_default=False)
+        str | None, typer.Option("--unit", help="Unit of the readings, for a file that does not state it: mm, um ...", show_default=False)
     ] = None,
     sign: Annotated[
         str | None,
-        typer.Option("--sign", help="measured-nominal or nominal-measured, for a file that does not say it.", show_default=False),
+        typer.Option(
+            "--sign",
+            help="Sign of the readings, for a file that does not state it: measured-nominal or nominal-measured.",
+            show_default=False,
+        ),
     ] = None,
     at_mm: Annotated[float | None, typer.Option("--at", help="Where the axis stood during a trace, mm.", show_default=False)] = None,
     scale_c: Annotated[
@@ -200,16 +206,16 @@ def _columns_asked(path: Path) -> ColumnFile:
     if has_decimal_commas(path.read_bytes()) and typer.confirm("are commas the decimal signs?", default=True, err=True):
         decimal = ","
     doc: dict[str, Any] = {"heading": heading, "decimal": decimal, "axis": _choice("which axis was measured", ("X", "Y", "Z"))}
-    moves = typer.confirm("did it move from target to target (no: it stood still)?", default=True, err=True)
+    moves = typer.confirm("did this axis move from target to target (no: it stood still)?", default=True, err=True)
     if moves:
         doc["target"] = column("the targets", "target", list(LENGTHS), "mm")
     else:
-        doc["at_mm"] = typer.prompt("where it stood, mm", type=float, err=True)
+        doc["at_mm"] = typer.prompt("where the axis stood, mm", type=float, err=True)
         doc["time"] = column("the time", "time", list(TIMES), "s")
     kind = _choice("readings are", ("deviation", "measured"), "measured" if "measured" in guess else "deviation")
     doc[kind] = column(f"the {kind} values", kind, list(LENGTHS | ANGLES) if kind == "deviation" else list(LENGTHS))
     if moves and typer.confirm("is there a column of the direction?", default="direction" in guess, err=True):
-        words = {sign: _prompted(f"its word for {sign} of the axis", usual) for sign, usual in (("plus", "+"), ("minus", "-"))}
+        words = {sign: _prompted(f"word for the {sign} direction of the axis", usual) for sign, usual in (("plus", "+"), ("minus", "-"))}
         doc["direction"] = column("the direction", "direction") | words
     return ColumnFile.model_validate(doc)
 

@@ -42,7 +42,7 @@ OfOption = Annotated[
 
 @model.command("list")
 def list_models(
-    of: Annotated[str | None, typer.Option("--of", metavar="NAME", help="Only this machine's.", show_default=False)] = None,
+    of: Annotated[str | None, typer.Option("--of", metavar="NAME", help="Only the versions of this machine.", show_default=False)] = None,
     db: DbOption = None,
     machine: MachineOption = None,
     as_json: JsonOption = False,

@@ -59,8 +59,8 @@ def solve(  # noqa: PLR0913 - every one of them is an option of the command
         ModelName | None,
         typer.Option(
             "--model",
-            help="rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: left-out set-ups and regions decide. "
-            "Default: rigid21, or rigid6 if the readings are too few.",
+            help="rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: whichever predicts left-out "
+            "set-ups and regions better. Default: rigid21, or rigid6 if the readings are too few.",
             show_default=False,
         ),
     ] = None,
@@ -268,7 +268,7 @@ def _write_report(
 def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     pattern: Annotated[str, typer.Argument(metavar="PATTERN", help="Campaigns by name, e.g. 'june-*'.")] = "*",
     model: Annotated[ModelName, typer.Option("--model", help="As for abbe solve.")] = ModelName.rigid21,
-    workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Processes of this computer.")] = 1,
+    workers: Annotated[int, typer.Option("--workers", min=1, max=256, help="Number of processes on this computer.")] = 1,
     dask: Annotated[
         str | None, typer.Option("--dask", metavar="ADDRESS", help="Use this scheduler of a Dask cluster instead.", show_default=False)
     ] = None,

@@ -44,7 +44,7 @@ StepOption = Annotated[
     typer.Option(
         "--step-moved",
         metavar="UM",
-        help="By how much the axis moved when the 10 µm step was loaded, µm: -10 confirms the sign, 10 turns it.",
+        help="By how much the axis moved when the 10 µm step was loaded, µm: -10 confirms the sign, 10 reverses it.",
         show_default=False,
     ),
 ]
@@ -165,7 +165,8 @@ def write_step(
         return
     typer.echo(f"wrote {', '.join(written)}\nload it instead of every other table; {step.place}: {step.expected}")
     typer.echo(
-        "if it moves the other way and no manual states the sign: abbe comp export --step-moved 10; by another amount: load no table"
+        "if it moves the other way and no manual states the sign: abbe comp export --step-moved 10; if it "
+        "moves by another amount: load no table"
     )
     conclude(f"abbe comp export SOLUTION --format {form} --step-moved -10 --out tables", machine=machine)
 

@@ -23,7 +23,9 @@ def drop(  # noqa: PLR0913 - one argument for each option
     ] = None,
     back: Annotated[
         Path | None,
-        typer.Option("--back", metavar="PATH", help="Files that the control wrote of its tables: confirms the drop.", show_default=False),
+        typer.Option(
+            "--back", metavar="PATH", help="Files of its tables that the control exported: they confirm the drop.", show_default=False
+        ),
     ] = None,
     seen: Annotated[
         bool, typer.Option("--seen", help="I have seen at the control that the tables are loaded: recorded as your statement.")

@@ -174,7 +174,7 @@ def accept_table(
 ALLOWED = {
     3: "unattended pushes",
     2: "pushes that a person attends",
-    1: "attended pushes, nothing acts while tables are exchanged",
+    1: "attended pushes; no table acts while tables are exchanged",
     0: "no push: read and export only",
 }
 
@@ -186,7 +186,7 @@ def commission(
     ] = False,
     one_bank: Annotated[
         bool,
-        typer.Option("--one-bank", help="The control has one table; I accept the lower level: nothing acts while tables are exchanged."),
+        typer.Option("--one-bank", help="The control has one table; I accept the lower level: no table acts while tables are exchanged."),
     ] = False,
     wait_s: WaitOption = 600.0,
     accept_table: AcceptTable = False,

@@ -28,7 +28,7 @@ from abbe.service.reference.printed import Computed, Given, Printed, agrees, com
 from abbe.service.reference.text import minus
 
 IK_BOUND_MM = 1e-7
-"""Largest deviation of the inverse from the commands of the example in math.md."""
+"""Largest deviation of the inverse kinematics from the commands of the example in math.md."""
 
 ALPHA = 0.01
 GRID = "9 × 9 points, steps of 0.25 mm as printed, ± 1 mm assumed from the stroke of 2 mm and the 82 points of the text"
@@ -76,13 +76,13 @@ def _kinematics() -> list[Comparison]:
 
 
 def _round_trip() -> list[Comparison]:
-    """Check that the inverse returns the commands whose ball centre math.md states."""
+    """Check that the inverse kinematics return the commands whose ball centre math.md states."""
     command, there = paper.EXAMPLES[1]
     back = inverse(assumed_geometry(), np.array([[p.value for p in there]]))[0]
-    how = "inverse of the ball centre that math.md states, geometry that it assumes"
+    how = "inverse of the ball centre that math.md states, with the geometry that math.md assumes"
     why = (
-        f"math.md 6: IK returns λ. Bound {IK_BOUND_MM:g} mm: the ball centre has nine decimals in math.md, and its rows show how far the"
-        " last ones are off"
+        f"math.md 6: the inverse kinematics return λ. Bound {IK_BOUND_MM:g} mm: math.md states nine decimals of the ball centre, and the"
+        " rows of the ball centre show how far the last decimals are off"
     )
     series = "back from the ball centre"
     return [
@@ -143,7 +143,7 @@ def in_plane(component: str, z_mm: float) -> F1:
 
 def _plane() -> list[Comparison]:
     found = plane()
-    wrong = Erratum("Table 1 is the minimum-norm solution of a fit on another plane; the origin of Z may have been another")
+    wrong = Erratum("Table 1 is the minimum-norm solution of a fit on another plane; perhaps Z had another origin")
     how = "implied_plane: median of the quotients of neighbouring coefficients"
     ratios = np.array([r for _, r in found.ratios_mm])
     why = f"{ratios.size} quotients between {ratios.min():.2f} and {ratios.max():.2f} mm, {paper.PLANE_Z_MM.value - found.z_mm:.2f} mm off"

@@ -175,7 +175,7 @@ def _known(cmm: Cmm) -> list[Comparison]:
 
 
 def _diagonals(cmm: Cmm) -> tuple[dict[str, float], float, float]:
-    """Return diagonals by squareness only (mm), misfit of the best order of the printed ones (rad), and mean of the printed ones (um)."""
+    """Return the diagonals by squareness alone (mm), the misfit of the printed diagonals in their best order (rad), and their mean (um)."""
     volume, squareness = machine_inputs(cmm)
     misfit, _ = best_assignment(cmm.type_name, volume, squareness, [d.value * 1e-3 for d in cmm.diagonals_um])
     return squareness_diagonals_mm(cmm.type_name, volume, squareness), misfit, float(np.mean(values(cmm.diagonals_um)))

@@ -93,5 +93,5 @@ def _combined(part: VectorCase, lobe: Lobe | None, checks: Checks) -> None:
     found = combined_deviation_mm(off, probe, n)
     checks.compare("actual - reading", found, part.at("actual_minus_reading"), unit="mm", floor=5e-17)
     approach, outward = printed_eq17_mm(off, probe, n, "approach"), printed_eq17_mm(off, probe, n, "outward")
-    checks.compare("eq (17), M the approach", approach, part.at("printed_eq17_with_M=approach=-n"), unit="mm", floor=5e-17)
-    checks.compare("eq (17), M outward", outward, part.at("printed_eq17_with_M=outward"), unit="mm", floor=5e-17)
+    checks.compare("eq (17), M is the approach", approach, part.at("printed_eq17_with_M=approach=-n"), unit="mm", floor=5e-17)
+    checks.compare("eq (17), M points outward", outward, part.at("printed_eq17_with_M=outward"), unit="mm", floor=5e-17)

@@ -59,7 +59,7 @@ PER_UM = 1e-3
 INVERTED = "the file's numbers come from inverted normal equations with a condition number of up to 1900 squared"
 DETERMINED = "last digits of a least-squares solution"
 DECIMALS = 4
-"""Decimals of the combinations of parameters in the file; the computed ones, rounded to them, must be equal."""
+"""Decimals with which the file states combinations of parameters; the computed combinations, rounded alike, must be equal."""
 NO_TRACE = 1e-9
 INNER = (0.1, 0.9)
 NODES = 4

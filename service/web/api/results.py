@@ -45,7 +45,9 @@ def _no_number(value: object) -> object:
 
 
 UtcTime = Annotated[datetime, BeforeValidator(_no_number)]
-After = Annotated[UtcTime | None, Query(description="Only later checks (UTC without an offset); absent: since the table came into force.")]
+After = Annotated[
+    UtcTime | None, Query(description="Only checks after this time (UTC if it has no offset); absent: since the table came into force.")
+]
 
 
 def add_results(app: FastAPI, sources: Sources) -> None:
@@ -108,7 +110,8 @@ def _add_checks(app: FastAPI, sources: Sources) -> None:
     @app.get("/api/v1/trends")
     @needs(Permission.READ)
     def trends(
-        machine: Annotated[str | None, Query(description="Absent: the machine of this service.")] = None, after: After = None
+        machine: Annotated[str | None, Query(description="Name of a machine; absent: the machine of this service.")] = None,
+        after: After = None,
     ) -> check_queries.Trends:
         """Whether the figures of the checks drift, since when, and when they reach their limits."""
         since = after.replace(tzinfo=UTC) if after is not None and after.tzinfo is None else after

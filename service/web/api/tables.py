@@ -55,7 +55,8 @@ def _add_proposals(app: FastAPI, sources: Sources) -> None:
     def diff(
         number: Number,
         other: Annotated[
-            int | None, Query(alias="with", ge=1, le=LARGEST, description="Another proposal; absent: the table in force.")
+            int | None,
+            Query(alias="with", ge=1, le=LARGEST, description="Number of the proposal to compare with; absent: the table in force."),
         ] = None,
     ) -> tables.ProposalDifference:
         """Changes of a proposal: nine tables in numbers, with uncertainty."""
@@ -113,7 +114,7 @@ def _add_pushes(app: FastAPI, sources: Sources) -> None:
     @needs(Permission.READ)
     def journal(
         machine: Filter = None,
-        push: Annotated[int | None, Query(ge=1, le=LARGEST, description="Only this push; each machine counts its own.")] = None,
+        push: Annotated[int | None, Query(ge=1, le=LARGEST, description="Only this push; each machine numbers its own pushes.")] = None,
         state: Filter = None,
         cursor: Cursor = None,
         limit: Limit = 50,

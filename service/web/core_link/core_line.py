@@ -137,7 +137,7 @@ class CoreLine:
 
     @contextmanager
     def listener(self, who: str = "") -> Iterator[Callable[[], AsyncIterator[Snapshot]] | None]:
-        """Subscribe to snapshots; yield None if this account or all together have too many listeners. Slow ones skip to the newest."""
+        """Subscribe to snapshots; yield None if this account or all together have too many listeners. Slow listeners skip to the newest."""
         if len(self._listeners) >= MOST_LISTENERS or list(self._listeners.values()).count(who) >= MOST_EACH:
             yield None
             return

@@ -180,7 +180,8 @@ class _Log:
     unrecorded: bool = False
 
     async def answered(self, status: int) -> None:
-        """Record the status of the answer. Per address few refusals are recorded (429: none); possible changes are always recorded."""
+        """Record the status of the answer. Only a few refusals per address are recorded (429: none); a request that may have changed
+        something is always recorded."""
         if status == 429 or (status >= 400 and (status < 500 or self.refused) and not self.auth.recorded_refusals.take(self.visit.address)):
             return
         kind = "replayed" if self.visit.replayed else "done" if status < 400 else "refused" if status < 500 or self.refused else "failed"

@@ -135,7 +135,7 @@ async def signature_refusal(
 def _add_reading(app: FastAPI, auth: Authenticator) -> None:
     refusals: dict[int | str, dict[str, object]] = {
         401: {"model": Problem, "description": "No user is logged in"},
-        403: {"model": Problem, "description": "The role does not allow it"},
+        403: {"model": Problem, "description": "The user's role does not allow the request"},
         429: {"model": Problem, "description": "Too many requests"},
         503: {"model": Problem, "description": "The store does not answer"},
     }
@@ -187,7 +187,7 @@ def _with_pin_here(auth: Authenticator, request: Request) -> list[str]:
 
 
 def _set_device_cookie(auth: Authenticator, request: Request, answer: Response, user: UserRecord, device: str) -> None:
-    """Mark a browser after a login by password, a known one anew."""
+    """Mark a browser after a login by password; a known browser gets a new mark."""
     made, life_s = auth.people.new_device(user, device), int(DEVICE_LIFE.total_seconds())
     tls = is_tls(request, behind_tls=auth.behind_tls)
     answer.set_cookie(auth.device_cookie(user.name), made, life_s, path="/login", httponly=True, samesite="strict", secure=tls)

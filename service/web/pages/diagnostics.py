@@ -29,11 +29,11 @@ _KEY = re.compile(rf"(?i){_NAMED}|^pass$|^abbe[_-]")
 _PEM = re.compile(r"-----BEGIN [^-]*PRIVATE KEY-----.*?(?:-----END [^-]*PRIVATE KEY-----|\Z)", re.DOTALL)
 _URL = re.compile(r"""(?<=://)([^:/@\s]*):[^\s"']+(?=@)""")
 _HEADER = re.compile(r"""(?i)((?:cookie|authori[sz]ation)(?:\\*["']?\s*[:=]|\\*["']\s*,)\s*)[^\r\n]+""")
-"""Only the end of the line ends the value of a header: `Basic dXNlcjpwYXNz`, `one=1; two=2`."""
+"""The value of a header may contain blanks, as in `Basic dXNlcjpwYXNz` and `one=1; two=2`: it ends at the end of the line."""
 _SCHEME = re.compile(r"((?i:\bbearer)\s+|\bBasic\s+(?=[A-Za-z0-9+/_-]{8}))[^\s\"']+")
 _BEFORE = rf"""(?:{_NAMED}|\bpass)[\w-]*(?:\\*["']?\s*[:=]|\\*["']\s*,)\s*|\babbe[_-][\w.-]*="""
 _QUOTED = re.compile(rf"""(?i)({_BEFORE})[bru]{{0,2}}(\\*)(["']).*?(?:(?<!\\)\2\3|(?=[\r\n])|\Z)""")
-"""A quoted value ends with its opening quotes, at the same level of escaping, or with a truncated line."""
+"""A quoted value ends at the same quotes, escaped as the opening ones, or where its line is cut off."""
 _BARE = re.compile(rf"""(?i)({_BEFORE})(?!\*\*\*)\S+""")
 
 

@@ -157,7 +157,7 @@ class DeviceLine:
 
 @dataclass(frozen=True, slots=True)
 class DeviceScreen:
-    """Devices, and the incidents of their connections in the latest campaigns; ``campaigns``: number of those."""
+    """Devices, and the incidents of their connections in the latest campaigns; ``campaigns``: number of these campaigns."""
 
     lines: Sequence[DeviceLine]
     incidents: Sequence[Trouble]

@@ -85,7 +85,7 @@ def ranking(prediction: StoredPrediction, motions: Mapping[str, MotionValue], ma
 
 
 def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, float]:
-    """Rms of a motion's effect over the nodes, and its standard uncertainty; an upper bound of it if the rms is not significant."""
+    """Rms of a motion's effect over the nodes, and its standard uncertainty; an upper bound of u if the rms is not significant."""
     values, vectors = np.linalg.eigh(mean_square)
     root = (vectors * np.sqrt(np.maximum(values, 0.0))) @ vectors.T
     vector, spread = root @ coefficients, root @ covariance @ root.T
@@ -98,7 +98,7 @@ def _size(mean_square: F2, coefficients: F1, covariance: F2) -> tuple[float, flo
 
 
 MOST_SOLUTIONS = 20
-"""Number of solutions in the list: a stored one has half a megabyte, and more would make the list slow."""
+"""Largest number of solutions in the list: each has half a megabyte, and more would make the list slow."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -16,7 +16,7 @@ from abbe.service.web.pages.runs import readings_of
 
 NOTHING: Doc = {"x": [], "low": [], "high": [], "whole": [0.0, 0.0], "readings": 0}
 PARTS = 1000
-"""Number of parts, about that of a screen's columns; if the shown time has fewer than twice as many readings, each of them is sent."""
+"""Number of parts, about as many as a screen has columns; if the shown time has fewer than twice as many readings, all are sent."""
 
 
 def envelope(x: F1, y: F1, low: float, high: float) -> tuple[F1, F1, F1]:

@@ -1,4 +1,4 @@
-"""Users on the page: an admin adds, disables and changes users; everybody changes the own password and PIN. `abbe user` calls the same
+"""Users on the page: an admin adds, disables and changes users; all users change their own password and PIN. `abbe user` calls the same
 functions."""
 
 from __future__ import annotations
@@ -75,7 +75,7 @@ def _add_forms(app: FastAPI, context: PageContext) -> None:
 
         def work(form: Form) -> None:
             if form.get("name", "") == own:
-                raise UserRefused("you change your own password in the settings", "give the present one there")
+                raise UserRefused("you change your own password in the settings", "give the present password there")
             people.set_password(form.get("name", ""), _same(form))
 
         return await _changed(request, context, lambda _: "password", work)

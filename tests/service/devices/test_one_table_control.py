@@ -193,6 +193,6 @@ def test_its_level_by_the_command(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
         assert "commission that lower level by name: abbe comp commission --one-bank" in capsys.readouterr().err
         assert run([*words, "--one-bank"]) == 0
     said = capsys.readouterr().out
-    assert "level L1: attended pushes, nothing acts while tables are exchanged" in said
+    assert "level L1: attended pushes; no table acts while tables are exchanged" in said
     assert "can_disable" in said
     assert control.acts

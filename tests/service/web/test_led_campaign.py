@@ -215,11 +215,11 @@ async def test_before_the_start_the_screen_says_what_comes_first_and_asks_for_no
     for seq, kind in enumerate((AlarmKind.RAISED, AlarmKind.MEASURED, AlarmKind.DISCOVERED)):
         number = plant.store.alarms.append(NAME, number or None, seq, kind, facts).alarm
         page = await desk.page(f"/new?recipe={CAMPAIGN}&alarm={number}", who)
-        words = ("from the first set-up", "searches in these runs", "computes the proposal")
+        words = ("from the first set-up", "search uses its runs", "proposal is computed")
         (said,) = (word for word in words if word in page)
         assert 'id="start"' in page
         shown[said] = page.count('type="checkbox"'), len(re.findall(r"<li>(Bar|Laser)", page))
-    assert shown == {"from the first set-up": (4, 19), "searches in these runs": (0, 0), "computes the proposal": (0, 0)}
+    assert shown == {"from the first set-up": (4, 19), "search uses its runs": (0, 0), "proposal is computed": (0, 0)}
 
 
 @pytest.mark.parametrize(("found", "label"), [(False, "Search for the cause"), (True, "Compute a proposal")])
