@@ -36,7 +36,7 @@ SIDE = 4
 
 @dataclass(frozen=True, slots=True)
 class Constants:
-    """Error of the line under a cloud of delays with a power-law distribution, in units of the 24th smallest delay, as a table.
+    """Table of the error of a line fitted under delays with a power-law distribution, in units of the 24th smallest delay.
 
     ``shape``: estimated exponents, one per column of the table. ``bias``: height error of the line in its middle. ``half``: half the
     width of the 95.45 % interval of the error in the middle. ``tilt``: half the width of this interval for the rise of the line from end to
@@ -149,11 +149,11 @@ def _above(x: F1, y: F1, a: int, b: int, c: int) -> bool:
 
 @dataclass(frozen=True, slots=True)
 class ClockFit:
-    """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, without the shortest delay.
+    """Host time as a function of device time: ``host = host_s0 + rate (device - device_s0)``, corrected for the shortest delay.
 
-    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of the host time in this middle, ``u_rate`` of
-    the rate, ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number of
-    arrivals left out because they came impossibly early.
+    ``device_s0`` is the middle of the fitted span. Standard uncertainties: ``u_offset_s`` of ``host_s0``, ``u_rate`` of the rate,
+    ``u_delay_s`` of the shortest delay, which arrivals cannot show. ``pairs``: number of arrivals used; ``early``: number of arrivals left
+    out because they came impossibly early.
     """
 
     device_s0: float

@@ -138,7 +138,7 @@ def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, m
 def _rival(some: _Candidates, through: F1, cost: float, pairs: dict[int, int], about: tuple[F1, F1, F1]) -> tuple[int, int, int] | None:
     """Find an equally good assignment that differs from ``pairs``; return a standstill and the two places to which it may belong, or None.
 
-    Both places are the same if ``pairs`` leaves this standstill out and assigns another standstill to its place.
+    If ``pairs`` leaves this standstill out and assigns another one to its place, this place is returned twice.
     """
     targets, levels, reach = about
     taken = {s: k for k, s in pairs.items()}
@@ -355,9 +355,9 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 
 
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
-    """Return whether the standstill of place ``k`` may also be that of the previous or next pass over the same target.
+    """Return whether the standstill of place ``k`` may belong to the previous or next pass over the same target instead.
 
-    The answer is yes if only one turning point lies between both passes, and neither this point nor the other pass has a standstill.
+    It may if only one place, a turning point, lies between the two passes, and neither this place nor the other pass has a standstill.
     """
     if k in (0, targets.size - 1):
         return False
@@ -434,7 +434,7 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
         return best.pairs
     stand, ours, other = best.rival
     at_s = found[stand].start_s - found[0].start_s
-    which = f"planned standstill {ours + 1} or {other + 1}" if ours != other else f"planned standstill {ours + 1}, and so may another one"
+    which = f"planned standstill {ours + 1}" + (f" or {other + 1}" if ours != other else ", but another standstill may be it, too")
     raise ValueError(f"dwells: the standstill that began {at_s:.1f} s after the first may be {which}; nothing is guessed, measure again")
 
 

@@ -48,7 +48,7 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources, varianc
 NODES = 7
 RANK_TOLERANCE = 1e-7
 TOWARDS_ESTIMATE = 1e-6
-"""Weight of a motion's own estimate relative to the deviation. It matters only for combinations that the deviation leaves open."""
+"""Weight of a motion's own estimate against the deviation; it decides only what the deviation does not determine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -234,12 +234,12 @@ def _refit(solution: JointSolution, keep: list[int]) -> F2:
 
 
 def positioning_only(tables: NineTables) -> NineTables:
-    """Return the three own-axis tables of nine (pitch error compensation), the others zero."""
+    """Return the nine tables with only the three own-axis tables kept (pitch error compensation); the six cross tables are zero."""
     return _kept(tables, lambda a: np.arange(3) == a)
 
 
 def cross_only(tables: NineTables) -> NineTables:
-    """Return the six cross tables of nine, own-axis tables zero; they complement `positioning_only`."""
+    """Return the nine tables with only the six cross tables kept; with `positioning_only` they give all nine again."""
     return _kept(tables, lambda a: np.arange(3) != a)
 
 

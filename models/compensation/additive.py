@@ -148,8 +148,8 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
 
     These are least-squares slopes over equidistant positions. Scale errors hold at the temperature of the machine during the measurement,
     without correction to 20 degree C (1 K of a steel machine is about 11 um/m). Their uncertainty therefore excludes the temperature of the
-    scales; it includes all other sources (`abbe.models.uncertainty.sources`), always also the laser's wavelength: as an unknown
-    (`laser_scale`) if a laser was used, otherwise as an assumed uncertainty of the reference length.
+    scales and includes all other sources (`abbe.models.uncertainty.sources`). One of these is the laser's wavelength: an unknown
+    (`laser_scale`) if a laser was used, otherwise an assumed uncertainty of the reference length.
     """
     sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # ``common`` holds the wavelength
     slopes = {}

@@ -146,7 +146,7 @@ def predict_distances(
 
 
 def _summed(known: F1, drawn: F2, unknown_mm: float) -> PredictedDistances:
-    """Return the statistics of the known error, shape (n,), plus each draw of the unknown one, shape (n, draws)."""
+    """Return the statistics of the sum of the known error, shape (n,), and each draw of the unknown error, shape (n, draws)."""
     size = np.abs(known[:, None] + drawn)
     rms, q95, largest = np.sqrt(np.mean(size**2, axis=0)), np.quantile(size, 0.95, axis=0), size.max(axis=0)
     return PredictedDistances(

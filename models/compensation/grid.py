@@ -181,7 +181,7 @@ def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitt
     """Return the node values of the best trilinear field per unit of each coefficient of the solution, shape (nodes, 3, terms).
 
     ``fitted``: fit by least squares over the volume of the grid; otherwise take the deviation at the nodes themselves. A term is at most
-    linear in the other two axes (rule G), and trilinear interpolation of these is exact, so the fit along its own axis is the fit over the
+    linear in the other two axes (rule G), where trilinear interpolation is exact. So a fit along the term's own axis is the fit over the
     volume (tests/models/compensation/test_tables_grid.py).
     """
     counts = tuple(p.size for p in position_mm)
@@ -252,8 +252,8 @@ def compensable_nodes(
     """Return the nodes at which the deviation exceeds its expanded uncertainty from all sources, shape ``counts``.
 
     The deviation is taken without rigid motion over the grid. ``k``: coverage factor, default for 95 %. Nodes are also excluded where an
-    error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors left out of the
-    uncertainty and of this error.
+    error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors to leave out of
+    the uncertainty and of this hidden error.
     """
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)

@@ -1,5 +1,5 @@
-"""Agreement of readings that were not fitted with their prediction: holdout runs, tested against noise and the uncertainty of the
-prediction; without holdout runs, the gap of blocks of the fitted runs that are left out in turn.
+"""How readings outside the fit agree with their prediction: holdout runs, tested against noise and the uncertainty of the prediction;
+without holdout runs, blocks of the fitted runs that are left out of the fit in turn.
 """
 
 from __future__ import annotations
@@ -36,8 +36,8 @@ class _Noise:
     """Noise of one instrument, estimated from the whitened residuals of the fitted runs.
 
     ``variance``: ratio of a reading's variance to the assumed one. ``freedom``: degrees of freedom of this estimate. ``spread``: variance
-    of the mean square of the residuals over that for independent normal readings. ``long``: variance of the mean of many readings over that
-    for independent readings, 1 or more.
+    of the mean square of the residuals, as a multiple of its value for independent normal readings. ``long``: variance of the mean of many
+    readings, as a multiple of its value for independent readings, 1 or more.
     """
 
     variance: float
@@ -151,8 +151,8 @@ def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float)
     """Ratio of rms to expected rms, and p; None where too few degrees of freedom remain.
 
     The last ``free`` columns of ``white`` are the run's own unknowns. They cost only as many degrees of freedom as the values determine
-    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value divided by
-    that of a reading. ``spread``: as in `_Noise`.
+    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value in units of
+    the noise variance of a reading. ``spread``: as in `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
     inner = known.T @ known
@@ -167,8 +167,7 @@ def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float)
 
 
 FOLDS = 5
-"""Number of blocks of a fitted run. Each fit leaves out one block of every run; this block lies on another part of the path from run to
-run."""
+"""Number of blocks of a fitted run. Each fit leaves out one block of every run, in neighbouring runs at different parts of the path."""
 
 
 def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[str, Floor]) -> Gap | None:

@@ -249,8 +249,9 @@ def gain_of(problem: WhitenedProblem, pick: Pick, taken: Taken) -> float:
 
 
 def _gain(problem: WhitenedProblem, pick: Pick, rows: F2) -> float:
-    """Compute the gain in double precision: where the projection leaves little of a column, single precision would cause errors of several
-    units in a gain of thousands."""
+    """Compute the gain in double precision. Where the projection leaves little of a column, single precision errs by several units in a
+    gain of thousands.
+    """
     projection = problem.projection
     columns = problem.white(pick.raw(problem))
     coordinates, also = projection.coordinates(columns), rows @ columns

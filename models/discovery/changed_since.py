@@ -96,7 +96,7 @@ def without(gram: F2, rhs: F1, base: F2) -> tuple[F2, F1]:
 
 
 def log_evidence(gram: F2, rhs: F1, base: F2) -> float:
-    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, minus the one if all unknowns are zero."""
+    """Return the log marginal likelihood with ``base`` (p, k) as factor of the prior covariance, relative to unknowns of zero."""
     if not base.shape[1]:
         return 0.0
     inside = base.T @ gram @ base
@@ -120,7 +120,7 @@ def _one(asked: AskedChange, gram: F2, rhs: F1) -> ChangeEvidence:
 
 @dataclass(frozen=True)
 class TakenChange:
-    """A chosen candidate: its size and its gain (after the price) given all other chosen ones, and its rivals as (name, missing gain)."""
+    """A chosen candidate: its size, its gain (after the price) given the other chosen ones, and its rivals with how much less they gain."""
 
     asked: AskedChange
     size: float
@@ -334,7 +334,8 @@ class ChangeContext:
     def judged(self, by_half: Sequence[Chosen]) -> tuple[float, float, float]:
         """Judge each half's choice by the other half: return rms residual without and with the choice, mm, and gain in log likelihood.
 
-        The rms is over all readings, with set-ups refitted. The gain is the smaller of both halves; all other unknowns are integrated out.
+        The rms is over all readings, with set-ups refitted. The gain is the smaller one of the two halves; all other unknowns are
+        integrated out.
         """
         old = self.known.coefficients
         before, after, count, gains = 0.0, 0.0, 0, []

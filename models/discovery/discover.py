@@ -170,7 +170,7 @@ def _labels(found: list[Selection], loud: tuple[VarianceFinding, ...]) -> set[st
 
 
 def _merged(old: tuple[VarianceFinding, ...], new: tuple[VarianceFinding, ...]) -> tuple[VarianceFinding, ...]:
-    """Return the old findings, then those of the new ones that have other labels."""
+    """Return the old findings, then the new findings whose labels are not among the old ones."""
     known = {f.label for f in old}
     return (*old, *(f for f in new if f.label not in known))
 

@@ -52,8 +52,9 @@ OFFSET = "offset"
 TIME_TRUE_TO_FORM = 0.3
 """Relative standard uncertainty of a thermal time constant: of several time constants, a short campaign shows only the short ones."""
 REST_SHARE = 0.1
-"""If part of the gap has no explanation, a name with less than this share of that part's evidence is a residue of it: an unknown effect
-always resembles some name a little. In cases whose effects were all found, no such part remains."""
+"""If part of the gap has no explanation, a name with less than this share of that part's evidence counts as a residue of that part: an
+unknown effect always resembles some name a little. In cases whose effects were all found, no such part remains.
+"""
 STARTS = 2000.0
 """Assumed number of starts that are compared in a campaign; it bounds the p-value of the best start."""
 
@@ -246,7 +247,7 @@ def _judge(
 
 
 def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
-    """Give the reason, by label, against effects that may be a part of what all findings leave without explanation (`REST_SHARE`)."""
+    """Return, by label, the reason against effects that may be only a part of what all findings leave unexplained (`REST_SHARE`)."""
     return {
         e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} stays unexplained: the effect may be only a part of that"
         for e in effects
@@ -257,7 +258,7 @@ def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
 def _with_ties(mean: Mapping[int, NamedEffect], pairs: frozenset[tuple[str, str]]) -> dict[int, NamedEffect]:
     """Add to each effect the named effects that the readings cannot tell from it (`ties`) as alternatives.
 
-    The evidence that is missing if only the other effect is in the fit, in place of only this one, is the difference of their evidences.
+    The missing evidence of such an alternative is the evidence of this effect minus the evidence of the other one.
     """
 
     def with_ties(e: NamedEffect) -> NamedEffect:
@@ -365,7 +366,7 @@ def _of_scatter(f: VarianceFinding) -> NamedEffect:
 
 
 def _next_test(problem: WhitenedProblem, judged: _Judgement, solved: SolvedModel, rivals: Sequence[Sequence[Rival]]) -> NextTest | None:
-    """Propose the measurement that best separates the strongest named effect with rivals from them; without rivals, a holdout run."""
+    """Propose what best separates the strongest effect that has rivals from its rivals; without rivals, a holdout run."""
     effects = {e.label: e for e in judged.effects}
     for i in judged.mean:
         pick = solved.picks[i]
@@ -385,7 +386,7 @@ def _next_test(problem: WhitenedProblem, judged: _Judgement, solved: SolvedModel
 def scattered(gaps: dict[str, Gap]) -> dict[str, Gap]:
     """Add the scatter of variance effects in the fitted runs to the noise floor of every role.
 
-    Nobody can predict this scatter, so its name closes no gap.
+    Nobody can predict this scatter, so naming its cause closes no gap.
     """
     fitted = gaps["identify"]
     scatter = max(fitted.after_mm**2 - fitted.floor_mm**2, 0.0)

@@ -38,7 +38,7 @@ CELLS = 4
 """Position cells along each axis."""
 LEAST = 20
 NEIGHBOURS, DIFFER = " (neighbours)", " up and down differ"
-"""Suffixes in the table: for the test of a run's neighbouring residuals, and for that of an axis' two directions."""
+"""Suffixes in the table of tests: correlation of a run's neighbouring residuals; difference between the two directions of an axis."""
 ROOM = 1.15
 """Factor on the noise variance, which is known to some percent only."""
 DEPENDS = {
@@ -261,8 +261,8 @@ def _whiteness(paths: tuple[Path, ...], whitened: tuple[F1, ...]) -> Iterator[_G
     """Test each run for correlation of neighbouring residuals: Ljung-Box over the first ten lags.
 
     In a short run, one spectral line of white noise that is strong by chance correlates all lags at once. Chi-square over ten independent
-    lags then gives too small a p: 1e-7 for a value that one of 4000 draws of 74 readings reaches. So p is at least that of such a line at
-    one of n/2 frequencies.
+    lags then gives too small a p: 1e-7 for a value that one of 4000 draws of 74 readings reaches. So p is at least the probability of such
+    a line at one of n/2 frequencies.
     """
     for p, r in zip(paths, whitened, strict=True):
         if p.n < 4 * LAGS:

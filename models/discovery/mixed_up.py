@@ -83,10 +83,11 @@ def _tried(problem: WhitenedProblem) -> Iterator[tuple[tuple[str, ...], str, F1]
 
 
 def wrong_tool(problem: WhitenedProblem) -> MixedUp | None:
-    """Find the tool that explains most of the misfit if one component of its vector changes sign; None if there is none or only one tool.
+    """Find the tool that explains most of the misfit if one component of its vector changes sign; None if none does.
 
-    If two tools explain it equally, both are named: reversed tool vectors with reversed rotations give the same readings.
-    ``problem``: as for `mixed_up`. Every tool and component is tried by a new fit of the simulation.
+    If two tools explain the misfit equally, both are named: reversed tool vectors with reversed rotations give the same readings. A
+    campaign with a single tool is not judged. ``problem``: as for `mixed_up`. Every tool and component is tried by a new fit of the
+    simulation.
     """
     tools = {_tool(p) for p in problem.paths}
     noise, plain = float(problem.use @ (1.0 - problem.projection.leverage)), _misfit(problem, problem)
@@ -111,7 +112,7 @@ def _tool(path: Path) -> tuple[float, ...]:
 
 
 def _turned(problem: WhitenedProblem, tool: tuple[float, ...], axis: int) -> WhitenedProblem:
-    """The problem with one component of one tool turned round in all its runs."""
+    """Return the problem with one component of a tool's vector negated, in all runs with this tool."""
     sign = np.where(np.arange(3) == axis, -1.0, 1.0)
     runs = []
     for run in problem.case.runs:
@@ -124,6 +125,6 @@ def _turned(problem: WhitenedProblem, tool: tuple[float, ...], axis: int) -> Whi
 
 
 def _misfit(problem: WhitenedProblem, scale: WhitenedProblem) -> float:
-    """Chi-square that a problem leaves, by the noise of ``scale``."""
+    """Chi-square of a problem's residuals with the noise of the problem ``scale``."""
     left = problem.projection.residual * problem.sd_mm() / scale.sd_mm()
     return float((scale.use * left) @ left)

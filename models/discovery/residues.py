@@ -28,9 +28,10 @@ AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "revers
 """Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect
 is a residue of the other, because a form that deviates by a ninth leaves 1.2 % of the evidence.
 
-The share was chosen on 52 cases (own ones from 410001, and practice) and 17 own doubles (from 720001). There the largest residues had 1.0 %
-and 0.9 %, and two small effects were true: a spike with 1.5 %, and a spike with 0.6 % that was found with three times its height. The
-second one loses its name."""
+The share was chosen on 52 cases (own ones from 410001, and practice) and 17 own cases with two effects (from 720001). There the largest
+residues had 1.0 % and 0.9 %, and two small effects were true: a spike with 1.5 %, and a spike with 0.6 % that was found with three times
+its height. The second one loses its name.
+"""
 ROUGH = (*AT_TURNS, "cyclic_error")
 """Effects with corners or waves."""
 KIN_SHARE = 0.04
@@ -43,14 +44,17 @@ its formula by a fifth (4 % of its evidence), the deviation resembles another ef
 false names had 0.2 to 3.1 % of the evidence of the strong effect; two true names had 9 %. Of the scales of the laser only the first may be
 a residue of the second: a misaligned beam has a size of its own in every set-up and leaves nothing that changes in time, as air does."""
 ROUGHEST = 4.0
-"""A mean effect leaves at most this many times its own roughness (squared second differences) at the places of a stick-slip. Leftovers are
-as rough if half of a wave is left at twice its frequency, or if corners are missed by their full height twice. In 17 own doubles (seeds
-720001 to 720120) the scatter of the true stick-slips was at least 6.7 times as rough as the strong effect of another axis."""
+"""A mean effect leaves at most this many times its own roughness (squared second differences) at the places of a stick-slip. That much
+remains if half of a wave is left at twice its frequency, or if corners are missed by twice their height. In 17 own cases with two effects
+(seeds 720001 to 720120) the scatter of the true stick-slips was at least 6.7 times as rough as the strong effect of another axis.
+"""
 CALM = 0.05
 """Readings with less than this share of the largest variance of a stick-slip lie outside of its places."""
 CLEARLY_WEAKER = 0.5
-"""Largest share of the other effect's own evidence at which an effect can be its residue. Above it, evidence that both share does not say
-which of the two is the deviation (`ties`). In the one tuned case that this evidence decides, the residue had 2.9 nats beside 68.9."""
+"""An effect can be a residue of another only if its own evidence is at most this share of the other's own evidence. Above this share, the
+evidence that both explain does not show which of them is the deviation (`ties`). In the one tuned case that was decided so, the residue had
+2.9 nats and the other 68.9.
+"""
 COMPANION_SHARE, COMPANION_OVERLAP = 0.005, 0.6
 """A name is a residue of another if its evidence is below `COMPANION_SHARE` of the other's and their signals overlap by more than
 `COMPANION_OVERLAP`."""
@@ -73,8 +77,8 @@ def shared(problem: WhitenedProblem, found: Sequence[Selection]) -> dict[tuple[s
 def too_smooth(problem: WhitenedProblem, solved: SolvedModel, loud: Sequence[VarianceFinding], rest: F1) -> frozenset[tuple[str, str]]:
     """Find the mean effects of other axes that are too smooth to leave the scatter of a stick-slip: pairs (stick-slip, mean effect).
 
-    Compared are the squared second differences of the residuals, above those outside of the places of the stick-slip, and of the effect's
-    own readings (`ROUGHEST`), both weighted with the variance of the stick-slip.
+    The function compares squared second differences (`ROUGHEST`), weighted with the variance of the stick-slip: those of the residuals,
+    above their mean outside of the places of the stick-slip, and those of the effect's own readings.
 
     Parameters
     ----------
@@ -184,8 +188,8 @@ def _together(a: str, b: str) -> bool:
 def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[str]) -> dict[str, str]:
     """Find names that score nothing once the residues are taken out of the fit, and give the reason by label.
 
-    Such a name only repairs what a residue spoils in other runs: three axes that seem to grow instead of the ball-bar shift the scale of
-    the laser, too. The reason lists every residue that alone makes the name score again; if none does, all residues.
+    Such a name only repairs what a residue spoils in other runs. For example, if three axes seem to grow because the ball-bar grows, the
+    scale of the laser has to shift, too. The reason lists every residue that alone makes the name score again; if none does, all residues.
 
     ``residue``: labels of the findings that are residues; labels of variance effects, which are not in the fit, change nothing.
     """

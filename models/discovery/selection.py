@@ -52,10 +52,11 @@ EXCLUDED = 12.0
 """A rival whose score is lower by this much chi-square is excluded."""
 TRIED = 8
 LIKE = 0.3
-"""Least share of the gain of the names that it would replace at which a rival in its textbook form is refined."""
+"""A rival in its textbook form is refined only if it has at least this share of the gain of the names that it would replace."""
 KIN = 0.02
-"""Rivals that explain all but this share of the gain are not excluded: a real effect deviates that much from its formula, and a name with
-more unknowns may win because it follows the deviations. So this does not hold for rivals with more unknowns than the name has."""
+"""A rival that explains all but this share of the gain is not excluded, because a real effect deviates that much from its formula. This
+rule does not hold for rivals with more unknowns than the name, which may explain more by following the deviations.
+"""
 
 
 def refined(problem: WhitenedProblem, pick: Pick, beside: Taken, *, sweeps: int = SWEEPS) -> tuple[Pick, float]:
@@ -261,7 +262,7 @@ def _second(effect: Effect, pick: Pick, paths: Sequence[Path]) -> Effect:
 
 
 def moments(paths: Sequence[Path]) -> tuple[float, ...]:
-    """Return times, s, at which something may begin: half way between successive runs, and in the middle of each but the first."""
+    """Return times, s, at which something may begin: half way between successive runs, and in the middle of each run but the first."""
     ends = sorted((float(p.at.t_s[0]), float(p.at.t_s[-1])) for p in paths)
     return tuple(t for (_, end), (start, last) in pairwise(ends) for t in (0.5 * (end + start), 0.5 * (start + last)))
 

@@ -13,8 +13,9 @@ from abbe.models.effects.path import Path
 
 FEWEST_RUNS = 8
 FOLLOWS, STRAYS = 0.99, 0.95
-"""Correlations with the warm-up: another column follows the warm-up if it reaches the first; the part's own column does not follow it if it
-stays below the second. In the practice set every own column reaches 0.999."""
+"""Correlations with the warm-up: another column follows the warm-up if its correlation reaches `FOLLOWS`; the part's own column does not if
+its correlation stays below `STRAYS`. In the practice set every own column reaches 0.999.
+"""
 
 
 def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values) -> str:
@@ -36,7 +37,7 @@ def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values)
     if like[own] >= STRAYS or like[best] < FOLLOWS:
         return ""
     return (
-        f"temp_{own}_C does not follow it (correlation {like[own]:.2f}), temp_{best}_C does ({like[best]:.2f}): "
+        f"temp_{own}_C does not follow the warm-up (correlation {like[own]:.2f}), but temp_{best}_C does ({like[best]:.2f}): "
         "see whether the columns are exchanged"
     )
 

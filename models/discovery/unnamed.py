@@ -70,7 +70,7 @@ def lacking(location: Localization) -> Structure:
     axis = f":{location.axes[0]}" if len(location.axes) == 1 else ""
     if location.shape:
         return Structure(f"{PREFIX}smooth{axis}", location.shape, 0.0, location)
-    return Structure(f"{PREFIX}place{axis}", "more is left than noise", 0.0, location)
+    return Structure(f"{PREFIX}place{axis}", "residuals larger than noise", 0.0, location)
 
 
 def describe_structure(structure: Structure, *, beside: bool) -> str:
@@ -115,9 +115,9 @@ _AGAIN = _Plan(
 )
 _PERIOD = _Plan(
     ("second_feed",),
-    ("a period of time", "a period of position"),
-    "at another feed, a period of time stays the same in seconds, a period of position in millimetres; reading the instrument at "
-    "standstill{standstill} shows whether the wave needs motion",
+    ("a wave in time", "a wave over the position"),
+    "at another feed, a wave in time keeps its period in seconds, a wave over the position keeps it in millimetres; reading the instrument "
+    "at standstill{standstill} shows whether the wave needs motion",
 )
 _BUMP = _Plan(
     ("second_radius",),
@@ -146,7 +146,8 @@ _BEAT = replace(_AGAIN, why=f"{_AGAIN.why}; reading the instrument at standstill
 _STANDSTILL = _Plan(
     ("longer_session",),
     ("the instrument", "the machine"),
-    "read the instrument at standstill for as long as {run} took: if it wanders there too, it is the instrument, its mounting or the air",
+    "read the instrument at standstill for as long as {run} took: if the reading wanders there too, the cause is the instrument, its "
+    "mounting or the air",
     always=True,
 )
 _PLANS = {

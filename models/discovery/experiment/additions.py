@@ -29,15 +29,15 @@ LATE_S = 3.0 * 3600.0
 GAP_S = 900.0
 FEED_MM_MIN = 1500.0
 SHORTEST_BAR_MM = 10.0
-"""No ball-bar is shorter."""
+"""Length of the shortest ball-bar."""
 OTHER_FEED = 1.3
 """Feeds that differ by a smaller factor count as one: feed-dependent effects then change too little to differ from geometry."""
 REPEAT_LATE_S = 3600.0
 """A repeat counts as late after this time: axes and spindle warm up within 20 minutes to two hours."""
 SAME_MM = 2.0
-"""Two paths are the same when their extents agree within this along every axis. Single readings do not tell, as they depend on the feed."""
+"""Two paths are the same if their extents agree within this along every axis. Single positions depend on the feed and are not compared."""
 SAME_LOOK = 0.01
-"""Beams whose unit vectors differ by less in every direction are parallel."""
+"""Beams are parallel if their unit vectors differ by less than this in every component."""
 GROWS = "errors that grow with the feed (lag, servo mismatch, vibration of the drives) look like geometry"
 TURNS = "errors that differ between the two directions along a path (lost motion, lateral play) look like geometry"
 LENGTH = "errors of the bar (its length, its balls, its temperature) look like errors of the machine"

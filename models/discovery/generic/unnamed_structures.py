@@ -141,7 +141,8 @@ def _lobes_by_latitude(power: int) -> Signal:
     """Make the signal of lobes (`lobes`) whose height goes with a power of the sine of the bar's latitude.
 
     On a smooth ball, lobes of constant height are impossible: they would meet at the pole. In spherical harmonics of order m their height
-    is the cosine of the latitude to the power of m, times a polynomial in its sine; the first two powers follow it where bars can read.
+    is the cosine of the latitude to the power of m, times a polynomial in its sine; the first two powers approximate it at the latitudes
+    that bars reach.
     """
 
     def signal(paths: tuple[Path, ...], key: str, values: Values) -> list[F2]:
@@ -298,7 +299,7 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     out = [
         _effect("smooth", "smooth function of one axis", COMPONENTS, (), absorbed_by=("rigid21",)),
         # Along the axis itself this has a name: backlash that depends on the position.
-        _effect("odd", "function of one axis that turns its sign with the direction", CROSS, ()),
+        _effect("odd", "function of one axis that changes its sign with the direction", CROSS, ()),
         _effect("lobes", "ball out of round", tuple(f"{a}{n}" for a in AXES for n in LOBES), (), forms=LOBE_FORMS),
     ]
     clock, tau = (0.0, end), Parameter("tau_s", "s", 20.0, 900.0, 120.0, SOURCE, (120.0,))
@@ -306,15 +307,15 @@ def _all(starts: Starts, paths: tuple[Path, ...]) -> list[Effect]:
     for key in AXES:
         out.append(_effect("step", "step of one axis", (key,), (_par("t0_s", clock, starts["step"][key]),)))
         out.append(_effect("settling", "one axis wanders off", (key,), (_par("t0_s", clock, starts["settling"][key]), tau)))
-    out.append(_effect("slip", "work holding gave way", ("",), (_par("t0_s", clock, starts["slip"][""]),)))
+    out.append(_effect("slip", "workpiece clamping gave way", ("",), (_par("t0_s", clock, starts["slip"][""]),)))
     for key in (*AXES, *sorted(kinds)):
         shortest = max(PERIODS_S[0], _resolved_s([p for p in paths if key in (*AXES, p.kind)]))
         resolved = tuple(v for v in starts["surge"][key] if v >= shortest)
         period = _par("period_s", (min(shortest, PERIODS_S[1]), PERIODS_S[1]), resolved)
-        out.append(_effect("surge", "wave on the clock", (key,), (period,), forms=(Form("second harmonic", surge_second),)))
+        out.append(_effect("surge", "wave in time", (key,), (period,), forms=(Form("second harmonic", surge_second),)))
     for key in CROSS:
         pitch = _par("pitch_mm", PITCHES_MM, starts["wave"][key])
-        out.append(_effect("wave", "wave along one axis across it", (key,), (pitch,), forms=(Form("second harmonic", wave_second),)))
+        out.append(_effect("wave", "wave across the motion of one axis", (key,), (pitch,), forms=(Form("second harmonic", wave_second),)))
     width = Parameter("width_mm", "mm", 8.0, 45.0, 20.0, SOURCE, WIDTHS_MM)
     out.append(_effect("bump", "bump at one place", ("",), (_par("at_s", clock, starts["bump"][""]), width)))
     b = starts["burst"]

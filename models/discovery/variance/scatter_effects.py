@@ -53,8 +53,9 @@ CLIPPED, MOSTLY = 4.0, 0.7
 `MOSTLY` of them lies there."""
 UNNAMED_PRICE = 3.0
 BURST_PRICE = 7.0
-"""Further price of a burst: noise has memory, so a few of its readings in a row are large more often than the price of a name says. The
-largest gain beyond the log of the trials was 11.3 in 146 campaigns without a burst; the weakest true burst of the practice set had 23."""
+"""Further price of a burst: noise has memory, so a few readings in a row are large more often than the price of a name assumes. The largest
+gain beyond the log of the trials was 11.3 in 146 campaigns without a burst; the weakest true burst of the practice set had 23.
+"""
 LEAST_OFF = 10
 """Minimum number of wrong readings of a ball-bar that get a name; fewer are left out of the fit without a message."""
 LEAST_LASER = 60

@@ -39,7 +39,7 @@ def test_a_wave_on_the_clock_with_a_second_harmonic_is_one_structure(second: flo
 
     found = discover(with_reading(sway), FEW)
     assert found.verdict == "unknown"
-    assert [label for label, _ in found.rejected if "wave on the clock" in dict(found.rejected)[label]] == ["unnamed_surge:Z"]
+    assert [label for label, _ in found.rejected if "wave in time" in dict(found.rejected)[label]] == ["unnamed_surge:Z"]
     assert found.location.period_s == pytest.approx(47.0, rel=0.01)
     assert left_over(found) < 1.03
 

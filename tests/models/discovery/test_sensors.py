@@ -38,7 +38,7 @@ def doubt(paths: list[Path], name: str = "axis_thermal_growth", key: str = "X") 
 
 def test_exchanged_columns_are_named() -> None:
     said = doubt(runs(x=hall, y=warm))
-    assert "temp_x_C does not follow it" in said
+    assert "temp_x_C does not follow the warm-up" in said
     assert "temp_y_C does (1.00)" in said
 
 
