@@ -29,9 +29,9 @@ WIDE = 10.0
 """Factor on the priors of the simulation's unknowns when they are projected out for testing, so that no finding rests on a prior."""
 ROUNDS = 2
 LOUDEST_MM = 0.1
-"""Prior standard deviation of the coefficients of ``also``."""
+"""Prior standard deviation of the coefficients of the columns in `WhitenedProblem.also`, mm."""
 STEADY = 0.02
-"""The noise has converged when its relative change is smaller."""
+"""The noise has converged when its relative change is smaller than this."""
 FITTED = 3.0
 """Factor on the priors where the simulation is fitted for linearisation."""
 

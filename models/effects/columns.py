@@ -45,9 +45,10 @@ WITH_CONSTANT = (1.4, 0.7)
 """Ratio of the rms of a smooth curve to its rms without its mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
 WITH_SLOW = (1.07, 0.06)
 """Ratio of the final drift of a head or column to that of the exponential that fits its first two or three hours best; with standard
-uncertainty. These parts have several time constants (ISO 230-3): with a second one a quarter to four times as long, of a weight of 15 to
-60 %, the median is 1.08 if a constant is fitted too, else 1.05, and two of three parts have 1.02 to 1.16. In 26 own and practice cases the
-fitted size was 9 % small on average. A screw is one body: its growth was 2 % small in 16."""
+uncertainty. These parts have several time constants (ISO 230-3): with a second one a quarter to four times as long, of a weight of 15 to 60
+%, the median is 1.08 if a constant is fitted too, else 1.05, and two of three parts have 1.02 to 1.16. In 26 own and practice cases the
+fitted size was 9 % too small on average. A screw is one body: in 16 cases its growth was 2 % too small.
+"""
 
 
 def axis_of(key: str) -> int:

@@ -94,7 +94,7 @@ class Effect:
         Whether the effect shifts the readings or adds noise (stick-slip, vibration with an unknown phase, outliers). The columns of a
         "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.
     one_sign : bool
-        Whether all coefficients have the same sign, either one: what set-ups have in common is the law of the error, not its size.
+        Whether all coefficients have the same sign, positive or negative: the set-ups share the law of the error, not its size.
     absorbed_by : tuple of str
         Entries of ``current_model.includes``: with any of them, the present model contains the effect, so that it is not a candidate.
     blind : tuple of str

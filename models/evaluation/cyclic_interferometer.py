@@ -34,7 +34,7 @@ TREND = 3
 class CyclicOrder:
     """Error ``amplitude`` sin(``order`` phase + ``start_rad``), with standard uncertainties; ``p``: probability of such an error by chance.
 
-    Unit of the amplitude: that of the fringe.
+    The amplitude has the unit of the fringe.
     """
 
     order: int

@@ -120,7 +120,7 @@ class DiagonalExpansion:
 
     @property
     def u_as_measured(self) -> float:
-        """Standard uncertainty of the deviation as measured, mm per mm: of each scale's temperature, and of the laser's own sensor."""
+        """Standard uncertainty of the deviation as measured, mm per mm, from each scale's temperature and the laser's own sensor."""
         scales = [
             share * (one.scale_per_k - one.laser_per_k) * one.u_temperature_k for one, share in zip(self.axes, self.shares, strict=True)
         ]

@@ -35,8 +35,9 @@ class LeftOut:
 class Standstill:
     """Result of a test at standstill. Two models compete: one of absolute temperatures, one of their changes since the start of each run.
 
-    ``since_start``: whether the model of changes predicts better; ``response``, ``left_out``: those of the better model;
-    ``shift_absolute``, ``shift_since_start``: offset of some runs that the one model, or the other, does not explain; None without one.
+    ``since_start``: whether the model of changes predicts better; ``response``, ``left_out``: results of the better model;
+    ``shift_absolute``, ``shift_since_start``: offset of some runs that the model of absolute temperatures, or of changes, does not explain;
+    None without such an offset.
     """
 
     since_start: bool
@@ -47,7 +48,7 @@ class Standstill:
 
 
 def standstill(runs: Sequence[StandstillRun]) -> Standstill:
-    """Fit the response of runs in their order by the model that predicts runs left out better.
+    """Fit the response of runs, given in their order, with the model that better predicts runs left out of the fit.
 
     Raises
     ------

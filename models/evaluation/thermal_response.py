@@ -1,8 +1,9 @@
 """Displacement of a standing spindle or table as the lagged response to temperatures (test at standstill, ISO 230-3).
 
 Every sensor acts twice: at once, and through a first-order lag whose time constant all sensors share, so that each may be fast, slow, or
-fast and then partly reversed. Sensitivities have one normal prior about zero. The scatter has a memory (Ornstein-Uhlenbeck). Priors, noise
-and time constant are those of largest evidence; time constants are averaged by their evidence. A lag starts in equilibrium.
+fast and then partly reversed. Sensitivities have one normal prior about zero. The scatter has a memory (Ornstein-Uhlenbeck). For each time
+constant, prior and noise are those of largest evidence; the fits of all time constants are averaged by their evidence. A lag starts in
+equilibrium.
 
 There are two models. The first takes absolute temperatures, which also show how the start differs from run to run. The second
 takes the changes since the start of a run, and the reading at the start. In both, each run has an offset, which is not predicted.
@@ -242,7 +243,7 @@ class Series:
 
 
 def shift_of(series: Series, kept: Sequence[int], fit: Fit) -> Shift | None:
-    """The most significant offset of two or more neighbouring runs, not the first two; None if chance explains the offset.
+    """Return the most significant offset of two or more neighbouring runs from the third run on; None if chance explains the offset.
 
     Each place is tried with several scatters from run to run. At the best place all noise is fitted again, because a fit without a shift
     counts the shift as noise. The p-value is multiplied by the number of places.

@@ -79,8 +79,8 @@ def exact_deviation_mm(
     ----------
     rotation : "vector", "zyx" or "small"
         How three angles make a rotation; the forms differ in second order only, and Pahk (1), (3) leave the choice open. ``vector``: by the
-        vector E. ``zyx``: Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation; that of a work-side carriage is −E, and its transform is
-        inverted exactly. ``small``: the papers' I + [E]×; on the work side, the exact inverse of I + [−E]×.
+        vector E. ``zyx``: Rz(EC) Ry(EB) Rx(EA) of the carriage's own rotation; a work-side carriage's own rotation is −E, and its transform
+        is inverted exactly. ``small``: the papers' I + [E]×; on the work side, the exact inverse of I + [−E]×.
     """
     axes_mm, motions = checked(axes_mm, motions)
     work, tool = split_chain(machine.chain)

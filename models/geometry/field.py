@@ -29,8 +29,9 @@ CORES = 2
 LEAST = 512
 """Number of points from which on it is worth testing whether they form a grid."""
 TILE = (8, 4000)
-"""Rows and columns of one product, among the fastest of 25 shapes tried: times 8, fewer than the 2**18 multiplications from which on
-OpenBLAS starts threads of its own."""
+"""Rows and columns of one product, among the fastest of 25 shapes tried. Such a product has 8 x 8 x 4000 multiplications, fewer than the
+2**18 from which on OpenBLAS starts threads of its own.
+"""
 
 Motions = Callable[[F2], F3]
 Lines = tuple[F1, F1, F1]

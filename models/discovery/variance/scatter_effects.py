@@ -313,9 +313,10 @@ def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
 def _bar_scatter(
     paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...], teeth: NDArray[np.bool_]
 ) -> list[VarianceFinding]:
-    """Find a rough place of the ball-bar and single wrong readings (``off``: 1 there); only the place if it holds most of these.
+    """Find a rough place of the ball-bar and single wrong readings (``off`` is 1 there); if most of these lie in the place, only the place.
 
-    Readings that a stick-slip makes scatter (``teeth``, stacked over the runs) are not wrong: a tooth that is one reading long looks alike.
+    Readings that a stick-slip makes scatter (``teeth``, stacked over the runs) do not count as wrong: a tooth of its saw-tooth that is only
+    one reading long looks like a wrong reading.
     """
     found = _rough_places(paths, tuple(np.clip(r, -CLIPPED, CLIPPED) for r in rest), sigma_mm)
     if found and found[0].evidence > 0.0:
@@ -329,7 +330,8 @@ def _bar_scatter(
 
 
 def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:
-    """Find the quarter of the sphere in which readings scatter more than in the rest, in nearly every run (`IN_RUNS`) that passes it.
+    """Find the quarter of the sphere in which readings scatter more than in the rest, in the share `IN_RUNS` or more of the runs that pass
+    it.
 
     A deviation of the mean that neighbours share is left out (as in `abbe.models.discovery.variance.spectrum.gated_roughness`).
     """
@@ -351,7 +353,7 @@ def _rough_places(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple
         return []
     gain, times, key, there = best
     size = float(np.sqrt(times**2 - 1.0) * np.mean(sigma_mm)) * UM
-    shape = f"readings scatter {times:.2g} times as much where the ball-bar points to {key[:2]} {key[2:]}, in all runs"
+    shape = f"readings scatter {times:.2g} times as much where the ball-bar points to {key[:2]} {key[2:]}, in most runs"
     location = Localization(localize_signal(paths, there).tests, depends_on=("bar azimuth",), shape=shape)
     evidence = float(gain - np.log(len(keys)) - NAME_PRICE - UNNAMED_PRICE)
     return [VarianceFinding("unnamed_rough", key, size, 0.3 * size, {"times": times}, evidence, location)]

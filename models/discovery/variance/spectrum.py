@@ -28,7 +28,7 @@ REGULAR = 0.02
 TOP = 24
 GATES_MM_S = (0.7, 0.9, 1.15, 1.45, 1.8, 2.25, 2.8, 3.5, 4.4)
 REFINED, WORTH = 2, 7.0
-"""Number of gates with the best scores that are fitted; all gates are fitted if the better one gains more than `WORTH`."""
+"""Number of gates with the best scores that are fitted; all gates are fitted if the best of them gains more than `WORTH`."""
 LEAST_READINGS = 12.0
 """A gate with fewer effective readings is not tried."""
 ALIKE = 1.94
@@ -230,8 +230,8 @@ def _height(variance: float, u: float) -> tuple[float, float]:
 
 
 def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -> Roughness:
-    """Average height and speed over all gates, each with its likelihood. An axis that creeps at one speed tells only their product: then
-    the most likely gate stays, whose product is right, with the uncertainty of all.
+    """Average height and speed over all gates, weighted with their likelihoods. If the axis creeps at one speed, the readings show only the
+    product of both: then keep the most likely gate, with the uncertainty over all gates.
     """
     found = {v_c: fit.gain(g) for v_c, g in gates.items()}
     gains = np.array([gain for gain, _, _ in found.values()])

@@ -29,7 +29,8 @@ def wave(at: Places, key: str, values: Values) -> F3:
 
 
 def _second(at: Places, key: str, values: Values) -> F3:
-    """Return the second harmonic: the signals' offsets make a wave of an encoder's period, unequal gains and phase error one of half of it.
+    """Return the second harmonic: offsets of an encoder's signals make a wave of its period; unequal gains and phase errors, of half its
+    period.
 
     Source: Heydemann, Appl. Opt. 20 (1981) 3382.
     """
@@ -47,7 +48,7 @@ def _along(path: Path, at: Places, key: str) -> F1:
 
 
 def _modulated(path: Path, at: Places, key: str, values: Values) -> F3:
-    """Return the wave times -1 .. +1 along the screw; the strength remains the mean amplitude."""
+    """Return the wave times the position, -1 .. +1 along the screw; the strength remains the mean amplitude."""
     x = _along(path, at, key)
     return along(axis_of(key), *(x * wave for wave in _waves(at, key, values, 1)))
 
@@ -77,7 +78,7 @@ EFFECT = Effect(
         Form("modulated twice", of_strokes(_modulated_twice)),
     ),
     needs="at least four readings per pitch along the axis; a laser step that is not a multiple of the pitch",
-    signature="a chirp on the circle: fast across the axis, slow near its reversals, the same in both directions",
+    signature="a chirp on the circle: fast where the axis moves fast, slow near its reversals, the same in both directions",
     remedy="mechanics",
     remedy_text="align screw, bearing and encoder coupling; a control with pitch-wise compensation can take the rest out",
     source="usual model: a sine and its harmonic over the pitch",

@@ -10,7 +10,7 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path
 
 HANDLED_K = 0.05
-"""Unit of the differences between the set-ups, K: small against the excess that they have in common, which stays the mean."""
+"""Unit of the differences between the set-ups, K: so small that the strength remains their common excess."""
 
 
 def _cooling(path: Path, tau_s: float) -> F2:
@@ -29,7 +29,7 @@ def _second_time(path: Path, key: str, values: Values) -> F2:
 
 
 def _handled(path: Path, values: Values) -> F2:
-    """Return the same for `HANDLED_K`: every set-up is handled anew, so each begins with another excess."""
+    """Return the same reading for an excess of `HANDLED_K`: every set-up is handled anew, so each begins with another excess."""
     return HANDLED_K * _cooling(path, values["tau_s"])
 
 

@@ -13,8 +13,8 @@ from abbe.models.effects.path import Path
 def scaled(path: Path, values: Values) -> F2:
     """Return half the displacement times 1 mrad^2; the coefficient of each laser set-up is theta^2 - 2 theta tilt in mrad^2.
 
-    The error is of second order. It has one sign in all set-ups if all mirrors are aligned the same way: square to the motion the laser
-    always reads long, square to the beam always short.
+    The error is of second order. It has one sign in all set-ups if all mirrors are aligned the same way: with mirrors square to the motion
+    the laser always reads long, with mirrors square to the beam always short.
     """
     return np.asarray(0.5 * PPM * path.travel_mm)[:, None]
 
@@ -41,7 +41,7 @@ EFFECT = Effect(
     signal=per_setup("laser", 1, scaled),
     one_sign=True,
     strength=strength,
-    needs="a ball-bar scale as reference: with a laser alone it is part of the axes' scales",
+    needs="a ball-bar scale as reference: with a laser alone this error is part of the axes' scales",
     signature="a scale error of each diagonal, constant over time and direction of motion",
     remedy="set-up",
     remedy_text="align the beam again over the full travel before the next diagonal",

@@ -75,8 +75,8 @@ class Weights:
         Factor, 1 or more, on the variance of the points: the part of the misfit that no parameter can explain, over its degrees of freedom.
     prior_factor : float
         Common factor, 1 or more, on all prior standard deviations, since the points cannot test each of them alone. It brings ``test.chi2``
-        down to dof or, if chi2 is at least twice the dof, to dof - 2 (dof / 2 if dof is below 4), because a factor estimated from few
-        directions is too small as often as too large.
+        down to dof or, if chi2 is at least twice the dof, to dof - 2 (dof / 2 if dof is below 4). That makes the factor larger, because a
+        factor estimated from few directions is often too small.
     carried : int
         Number of carried directions, with both factors.
     test : PriorTest
