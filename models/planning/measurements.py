@@ -41,7 +41,7 @@ ORDERS = tuple("".join(p) for p in permutations("XYZ"))
 SHORTEST_TOOL_MM = 1.0
 """A shorter tool vector leaves open on which side of the cup the spindle is."""
 OBLIQUE = 0.5
-"""The spindle's direction is doubtful from this ratio of the tool's second longest to its longest component on."""
+"""The spindle's direction is doubtful if the tool's second longest component is at least this share of its longest."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -261,7 +261,7 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it may be wrong (empty: the tool shows it)."""
+    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it is doubtful, else empty."""
 
     axis: int
     side: int

@@ -315,7 +315,7 @@ def limit(search: PlanSearch, rows: F2) -> tuple[float, str]:
 
 
 def shortest(search: PlanSearch, rows: F2, wanted_mm: float, budget_min: float, passes: int) -> tuple[Chosen, bool]:
-    """The shortest plan found that reaches the goal within the budget, or the best plan for the budget and False."""
+    """The shortest plan found that reaches the goal within the budget, and True; if none does, the best plan for the budget, and False."""
     first = minutes_needed(search, rows, wanted_mm, {}, budget_min)
     if first is None:
         chosen = search.exchange(search.best_fill(budget_min), budget_min, passes)

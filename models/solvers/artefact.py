@@ -10,13 +10,13 @@ x axis coordinates, N nominal place of the feature, D machine's deviation at x w
 
 Unknowns: ``pose_<setup>_x/y/z`` (mm), ``turn_<setup>_a/b/c`` (rad, artefact axes), ``sway_<setup>_x/y/z`` (mm/s, drift of the pose);
 ``form_<artefact>_<feature>_x/y/z`` (mm, directions that were sensed), ``scale_<artefact>`` (free unless a length is calibrated),
-``expansion_<artefact>`` (1/K, added to the stated one), ``warmth_<artefact>`` (K, of the sensor), ``twist_<artefact>_0..5`` (mm at
-the farthest feature: rotation or scale growing with r^2, bends; clamping or springing back leaves them in a workpiece),
-``shear_<artefact>_stretch/square`` (mm there: of the artefact, or of the
-CMM), ``cmm_<artefact>`` (its scale), ``stylus_<source>`` (mm),
-``lobing_<direction>_x/y/z`` (mm, machine axes: shift of touches that start in this direction; of a wall with this normal: pre-travel),
-``clamp_<setup>_..``, ``warp_<setup>_..`` (mm at the farthest feature: bends in one pose), ``calibration_<artefact>_<from>_<to>`` (mm),
-``step_<setup>_x/y/z/a/b/c`` (mm, rad: motion of the artefact during the run), and fine structure of the machine (`Fine`).
+``expansion_<artefact>`` (1/K, added to the stated one), ``warmth_<artefact>`` (K, of the sensor), ``twist_<artefact>_0..5`` (mm at the
+farthest feature: rotation or scale growing with r^2, bends; clamping or springing back leaves them in a workpiece),
+``shear_<artefact>_stretch/square`` (mm at the farthest feature: shear of the artefact, or of the CMM), ``cmm_<artefact>`` (scale of the
+CMM), ``stylus_<source>`` (mm), ``lobing_<direction>_x/y/z`` (mm, machine axes: shift of touches that start in this direction, or pre-travel
+of walls with this normal), ``clamp_<setup>_..``, ``warp_<setup>_..`` (mm at the farthest feature: bends in one pose),
+``calibration_<artefact>_<from>_<to>`` (mm), ``step_<setup>_x/y/z/a/b/c`` (mm, rad: motion of the artefact during the run), and fine
+structure of the machine (`Fine`).
 
 Source: artefact-based self-calibration by reversal, Evans, Hocken and Estler, CIRP Annals 45/2 (1996) 617.
 """
@@ -44,8 +44,8 @@ class Fine:
     """Fine structure of one axis' motion that no polynomial follows: one unknown, mm, in direction ``component``.
 
     With ``period_mm`` above 0 it is a wave over the position: cosine (``phase`` 0) or sine (1). Otherwise it is one displacement of all
-    points within `SAME_PLACE_MM` of ``at_mm``. Several waves stand for one found period, ``found_mm``; ``probability``: that this period is
-    real.
+    points within `SAME_PLACE_MM` of ``at_mm``. Several waves stand for one found period, ``found_mm``; ``probability``: probability of this
+    period.
     """
 
     axis: int
@@ -77,7 +77,7 @@ class Fine:
 
 @dataclass(frozen=True, eq=False)
 class ArtefactPoints:
-    """Data of an artefact's run besides the columns of every run; one row per component of a point.
+    """Data that only the run of an artefact has; one row per component of a point.
 
     Attributes
     ----------
@@ -177,7 +177,7 @@ class ArtefactPriors:
 
 PRIORS = ArtefactPriors()
 LEARNED = ("sway", "form", "twist", "lobing", "clamp", "warp", "nugget")
-"""Classes of these unknowns whose typical size is estimated from the data."""
+"""Classes of an artefact's unknowns whose typical size is estimated from the data."""
 
 
 def unknowns(p: ArtefactPoints, setup: str, span_s: float, priors: ArtefactPriors = PRIORS) -> dict[str, float]:
@@ -375,7 +375,7 @@ def form_rows(p: ArtefactPoints, features: Sequence[str], nominal_mm: F2, names:
 
 
 def _expansion(p: ArtefactPoints, known: Known) -> tuple[float, F1]:
-    """Expansion per K, and temperature that makes each reading longer: of a probed artefact now, of a workpiece when it was made."""
+    """Expansion per K, and temperature that lengthens each reading: a probed artefact's own now, a workpiece's when it was made."""
     more, offset = known.get(f"expansion_{p.artefact}", f"warmth_{p.artefact}")
     sensed = p.warm_K if p.source == "length" else p.warm_K + offset
     return p.expansion_per_K + float(more), -sensed if p.source == "cmm" else sensed

@@ -150,7 +150,7 @@ def _disagreement(runs: tuple[RunData, ...]) -> float:
 
 
 def turned_run(run: RunData, quarter: int) -> RunData | None:
-    """Return a run as if the artefact lay some quarter turns further about its centre; None if a feature then lies at no other's place."""
+    """Return a run as if the artefact lay some quarter turns further about its centre; None if a feature then lies at no nominal place."""
     p = run.points
     if p is None or p.source == "length":
         return None
@@ -194,7 +194,7 @@ def _step(problem: CampaignProblem, fit: CampaignFit) -> tuple[tuple[RunData, ..
 def _moved_step(
     runs: tuple[RunData, ...], problem: CampaignProblem, fit: CampaignFit, label: str, settle: Settle
 ) -> tuple[tuple[RunData, ...], CampaignProblem, CampaignFit]:
-    """Move a step over neighbouring points that the fit left out, if it then leaves out fewer points: these lay on the other side."""
+    """Move a step past neighbouring points that the fit left out, if the fit then leaves out fewer: those lay on the other side."""
     i = next(k for k, r in enumerate(runs) if r.label == label)
     run, weight = runs[i], problem.split(fit.weight)[i]
     assert run.points is not None
@@ -270,7 +270,7 @@ def _twist(joint: JointSolution) -> list[ArtefactFault]:
         if abs(value) > max(TWIST_MM, SIGMA * u, 3.0 * usual) and _share(poses[0], places, e.theta, e.names, value) > MOST:
             what = (
                 f"a rotation that grows with r², {1e3 * value:+.1f} ± {2e3 * u:.1f} µm at the rim, turns with the part in "
-                f"{len(poses)} poses: as far as these poses show, it is form of the plate (a twist), not a motion of the machine"
+                f"{len(poses)} poses: as far as these poses show, this is a form of the plate (a twist), not a motion of the machine"
             )
             out.append(ArtefactFault(mine[0][0].label, what, "left out of the machine"))
     return out

@@ -21,7 +21,7 @@ def fine_of(joint: JointSolution) -> tuple[Fine, ...]:
 
 
 def motion_rows(joint: JointSolution, tool_mm: F1 | None, points_mm: F2, fine: Iterable[Fine]) -> F3:
-    """Derivative of the deviation at points by all unknowns of the solution, shape (n, 3, unknowns); of fine structure only by ``fine``."""
+    """Derivative of the deviation at points by the unknowns, shape (n, 3, unknowns); zero for fine structure that is not in ``fine``."""
     names = {name: i for i, name in enumerate(joint.estimate.names)}
     out = np.zeros((len(points_mm), 3, len(names)))
     out[:, :, : len(joint.terms)] = design(with_tool(joint.machine, tool_mm), joint.terms, points_mm)

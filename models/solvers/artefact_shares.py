@@ -1,8 +1,8 @@
 """Split of the named error fields of a plane into errors of an artefact and errors of the machine, with U and evidence.
 
 The form of the artefact and the map of the machine are unknowns of one solution, and only the poses separate them. If the poses hide a
-field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors. So is the split of a
-field which is certain in the reading, but neither in the part nor in the machine.
+field (`abbe.models.solvers.observability.poses`), its split is reported as unknown: it would come from the priors. The split is also
+unknown if a field is certain in the readings, but neither in the part nor in the machine.
 
 Evidence: log of the Savage-Dickey ratio of a normal prior and posterior at zero, nats (Dickey 1971).
 """
@@ -62,10 +62,10 @@ def _um(value_mm: float, u_mm: float) -> str:
 
 
 def shares_text(found: tuple[Share, ...], rank: PoseRank | None) -> str:
-    """Return one line on all fields, with the pose that would show the unknown ones; empty without any."""
+    """Return one line on all fields, with the pose that would show the unknown ones; empty without fields."""
     if not found or rank is None:
         return ""
-    line = f"At {found[0].reach_mm:.0f} mm from its centre: {'; '.join(s.text for s in found)}."
+    line = f"At {found[0].reach_mm:.0f} mm from the part's centre: {'; '.join(s.text for s in found)}."
     lost = [s.field for s in found if s.verdict == "unknown"]
     cure = next(((name, fields) for name, _, fields in rank.cures if set(fields) & set(lost)), None)
     return line + (f" A further pose {cure[0]} would show: {', '.join(cure[1])}." if cure is not None else "")
@@ -137,7 +137,7 @@ def _weights(q: F2) -> F2:
 def _in_the_part(probed: list[ArtefactPoints], places: dict[str, F1]) -> F3:
     """Return weights by which the machine's deviations at all readings enter the part's amounts, shape (5, readings, 3).
 
-    What the solution does not follow of them counts as form: the place of a feature is the mean of its readings.
+    The part of these deviations that the solution does not follow counts as form, because a feature's place is the mean of its readings.
     """
     p, order = probed[0], {f: i for i, f in enumerate(places)}
     weights = np.zeros((len(NAMED), len(places), 3))

@@ -45,7 +45,7 @@ __all__ = ["MapAgainstPrior", "Observability", "map_against_prior", "motions_of"
 
 SIGMA_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
 FLOOR_MM = {"bar": 0.5e-3, "laser": 0.3e-3}
-"""Default noise of one reading and least uncertainty of an averaged one, mm, for a campaign that is only planned."""
+"""Default noise of one reading and least uncertainty of an averaged reading, mm, for a campaign that is only planned."""
 
 
 @dataclass(frozen=True)
@@ -139,7 +139,7 @@ def observability(
     priors : Priors, optional
         As in `abbe.models.solvers.joint.solve_joint`.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
-        Standard uncertainty of one raw reading, mm, and the least one of an averaged value.
+        Standard uncertainty of one raw reading, and least standard uncertainty of an averaged value, mm.
     known : Knowledge, optional
         Knowledge of the set-up for the rank; default `stated_knowledge`: what the runs themselves state.
 
@@ -177,10 +177,11 @@ def observability_of(solution: JointSolution, known: Knowledge | None = None) ->
 
 
 LARGEST_MAP = 3.0
-"""Largest rms of a predicted map, as a multiple of that of a usual machine."""
+"""Largest rms of a predicted map, as a multiple of the rms of a usual machine's errors."""
 MOST_READ = 2.0
-"""Largest excess of the rms of a map over that of a usual machine, as a multiple of the largest rms of a run. Of 500 campaigns of one to
-five runs one exceeded it: a step diagonal alone on a rough machine, whose map was 6 times as large as the machine's errors."""
+"""Largest excess of a map's rms over the rms of a usual machine's errors, as a multiple of the largest rms of a run. One of 500 campaigns
+of one to five runs exceeded this limit: a single step diagonal on a rough machine, whose map was 6 times as large as the machine's errors.
+"""
 WELL_KNOWN = 0.2
 """Relative uncertainty below which a map may be larger than what was measured: a small circle shows the squareness of a large machine."""
 MAP_NODES = 5
@@ -294,7 +295,7 @@ def _report(
 
 
 def _knowing(beliefs: _Beliefs, p: int) -> Knowing:
-    """Covariances of the terms; the noise part is that of the estimator with its priors."""
+    """Covariances of the terms; the noise part belongs to the estimator with its priors."""
     plain = posterior_covariance(beliefs.information, beliefs.prior_root)[:p]
     root = beliefs.prior_root[:p]
     return Knowing(root @ root.T, beliefs.covariance[:p, :p], plain @ beliefs.information @ plain.T / beliefs.noise_mm**2)

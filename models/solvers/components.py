@@ -30,7 +30,8 @@ LEAST_ETA: F1 = np.array([0.0 if kind == "artefact" else -8.0 for kind in KINDS]
 """Least log ratio of noise variance to expected noise variance, by instrument. A factor of 55 in the standard deviation is below any
 resolution; without a limit, readings without noise would drive the ratio to minus infinity and the normal equations beyond double
 precision. The noise of an artefact's points is never below their stated repeatability: with a free form, few poses would fit any scatter,
-even that of the touch's resolution."""
+even the scatter from the touch's resolution.
+"""
 CLEAR = 1.5
 """Gain in log evidence that makes a choice clear: odds of 4 to 1."""
 STEPS = 25
@@ -340,7 +341,7 @@ def cautious(model: SizeModel, found: FittedComponents, share: float = 1.0) -> t
     - The variance of a motion or slope is its posterior mean (log-normal: exp(psi + v/2)), not its most probable value. For two motions
       that the readings hardly separate, the most probable sizes are too small. Without information the limit is the documented variance; on
       a machine whose own size is estimated (artefacts) as m times the usual one, the limit of the standard deviation is m^2 times the
-      documented one. The larger the machine, the less the documented sizes tell of motions that its readings do not show.
+      documented one. The larger a machine's errors, the less the documented sizes tell about motions that its readings do not show.
     - The prior of every shape has at least `SMALLEST_BEND` of the documented size: no guideway is known to be smooth to nanometres.
     """
     rough = np.array([name.startswith("smoothness ") for name in model.names])

@@ -1,6 +1,6 @@
 """Core of the joint solution: one campaign as scaled arrays, and its iteration to the exact model.
 
-Details of a motion that neither a smooth nor a rough basis follows are one unknown per place of a step test (`with_details`).
+If neither a smooth nor a rough basis follows a motion, every place of a step test gets an unknown for its details (`with_details`).
 """
 
 from __future__ import annotations
@@ -288,7 +288,7 @@ def _spread(problem: CampaignProblem, whole: InformationSums, c: Components, siz
 def _finish(problem: CampaignProblem, x: F1, weight: F1, c: Components, gram: Grams) -> CampaignFit:
     """Solve a last time with the exact residuals; correlated neighbours count as fewer readings.
 
-    The estimate is that of the cautious prior. The covariance of a rough machine is that of a narrower prior (`ROUGH_CAUTION`).
+    The estimate uses the cautious prior. The covariance of a rough machine uses a narrower prior (`ROUGH_CAUTION`).
     """
     r, typical = problem.readings, problem.sizes.typical
     residual = problem.measured - problem.predicted(typical * x)
@@ -330,7 +330,7 @@ def sums_of(problem: CampaignProblem, fit: CampaignFit, rows: NDArray[np.intp]) 
 
 
 def rough_evidence(problem: CampaignProblem, fit: CampaignFit, terms: tuple[Term, ...]) -> float:
-    """Score for further terms, whose variance the fit takes as zero, in standard deviations that the score has without such terms.
+    """Score for further terms, whose variance the fit takes as zero, in units of its standard deviation if there are no such terms.
 
     The score is the derivative of the log evidence by the variance of ``terms`` (prior: `size_model`), divided by the root of its expected
     information (Rao's score test). It is positive if residuals are more alike than noise at readings where these terms are alike.

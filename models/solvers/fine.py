@@ -142,5 +142,5 @@ def _waves(peaks: tuple[Peak, ...]) -> tuple[Fine, ...]:
 
 
 def sure_periods(fine: tuple[Fine, ...]) -> tuple[tuple[int, float], ...]:
-    """Axes and periods, mm, that no other explanation rivals: of at least the probability `SURE`; each once."""
+    """Axes and periods, mm, without a rival explanation: periods of at least the probability `SURE`, each only once."""
     return tuple(dict.fromkeys((one.axis, one.found_mm) for one in fine if one.period_mm and one.probability >= SURE))

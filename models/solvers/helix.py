@@ -23,8 +23,9 @@ LINEAR = ("EXX.1", "EYY.1", "EZZ.1", "C0Y", "B0Z", "A0Z")
 SETUP = ("offset_x", "offset_y", "offset_z", "bar_length")
 CONDITION_LIMIT = 45.0
 """Limit of the condition number. By the angle law a full hemisphere (nine or ten unknowns, 63 to 1000 points) has 28 to 32 with three
-turns, 58 to 68 with two, over 1900 with one. By the area law two turns have about 30, so no warning; only the recipe's minimum of three
-turns excludes them."""
+turns, 58 to 68 with two, over 1900 with one. By the area law two turns have about 30 and cause no warning; only the recipe's minimum of
+three turns excludes them.
+"""
 LOST = ("backlash_X", "backlash_Y", "backlash_Z")
 
 
@@ -95,7 +96,7 @@ def fit_helix(
     unknowns: Unknowns = "ten",
     u_length_mm: float = 0.0015,
 ) -> HelixSolution:
-    """Fit six scale and squareness parameters to helices about one centre, in the paper's form without lost motion (else `fit_run`).
+    """Fit six scale and squareness parameters to helices about one centre, in the paper's form, without lost motion (with it: `fit_run`).
 
     Parameters
     ----------

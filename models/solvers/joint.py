@@ -43,8 +43,9 @@ from abbe.models.solvers.residuals import Outlier, ResidualTest, residual_tests
 from abbe.models.solvers.scale_drift import ScaleDrift, drift_factor, scale_drifts
 
 ROUGH_EVIDENCE, ROUGH_POINTS = 5.0, -1.0
-"""The solution includes the motions' rough parts if the score for these parts exceeds its expectation by this many standard deviations;
-fewer are enough for points of artefacts, which are few."""
+"""The solution includes the motions' rough parts if the score for these parts exceeds its expectation by `ROUGH_EVIDENCE` standard
+deviations, or by `ROUGH_POINTS` for points of artefacts, which are few.
+"""
 Model = Literal["rigid6", "rigid21", "auto"]
 
 
@@ -218,8 +219,8 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     model : "rigid6", "rigid21" or "auto"
         Three scales and three squareness errors; 21 error motions; or these six errors if left-out set-ups and regions do not support more.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
-        Start values of the estimated noise: standard uncertainty of one raw reading, and least one of an averaged value. Default: from
-        repeats, and the resolution.
+        Start values of the estimated noise: standard uncertainty of one raw reading, and least standard uncertainty of an averaged value.
+        Default: from repeats, and the resolution.
     progress : callable, optional
         Called with one line of text per stage.
 

@@ -19,7 +19,7 @@ LEAST_SPREAD_MM = 1e-4
 """Least robust standard deviation: the resolution of a usual ball-bar, so that rounding makes no outliers."""
 
 LEAST_BAR_MM = 1.0
-"""No ball-bar is shorter; a position nearer to the cup is a mistake."""
+"""Length of the shortest ball-bar; a position nearer to the cup is a mistake."""
 
 
 @dataclass(frozen=True)

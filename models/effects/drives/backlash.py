@@ -77,7 +77,8 @@ EFFECT = Effect(
     needs="runs in both directions; a laser alone hardly separates X, Y and Z",
     signature="circle and helix: a step outward at both ends of the axis, equal at all feeds; laser: forth and back stay apart",
     remedy="control parameter",
-    remedy_text="enter the width as backlash compensation of the axis; if it grows or exceeds 30 um: check screw nut, coupling, thrust bearing",
+    remedy_text="enter the width as backlash compensation of the axis; "
+    "if it grows or exceeds 30 um: check screw nut, coupling, thrust bearing",
     source="ISO 230-2 (reversal value), ISO 230-4; usual model: a step with the direction of motion",
     separated_by={
         "backlash": ("ballbar", "planar_circles", "opposite_direction"),

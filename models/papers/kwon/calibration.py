@@ -290,7 +290,7 @@ class KwonCalibration:
     def _identified(self) -> list[str]:
         n, identified = len(PARAMETERS), self.identifiability
         parts = [
-            f"the points see {identified.rank} of {n} combinations of parameters, and {self.carried} of them better than the prior",
+            f"the points determine {identified.rank} of {n} combinations of parameters, and {self.carried} of them better than the prior",
             f"single values that rest on the prior: {', '.join(self.on_prior) or 'none'}",
         ]
         hidden = ", ".join(_combination(h) for h in identified.hidden)

@@ -110,8 +110,8 @@ def as_measured(kind: PahkType, tables: ParameterTables, setup: OffsetSetup, sti
     """Return the parameters as instruments measure them on the lines of a set-up, from parameters that refer to the origin.
 
     Positioning is the deviation along the line less its value at the start. Straightness is the deviation across the line less its
-    least-squares line, for a workpiece-side axis as the table's own motion. Squareness is minus the sum of the two slopes, with the sign of
-    alpha of the type. Angles are the same on all lines.
+    least-squares line; for a workpiece-side axis it is the table's own motion. Squareness is minus the sum of the two slopes, with the sign
+    of alpha of the type. Angles are the same on all lines.
 
     Parameters
     ----------

@@ -263,8 +263,8 @@ class ProbeCalibration:
     def uncertainty_mm(self, noise_mm: float) -> tuple[F1, F1]:
         """Return the standard uncertainties of centre x, y, z and effective radius (4,), and of each map value (n,).
 
-        ``noise_mm`` is the standard deviation of the radial noise of one touch; NaN (unknown) gives NaN. A map value is a
-        residual, and its variance is that of the noise times (1 - leverage).
+        ``noise_mm`` is the standard deviation of the radial noise of one touch; NaN (unknown) gives NaN. A map value is a residual, and its
+        variance is the variance of the noise times (1 - leverage).
 
         Raises
         ------

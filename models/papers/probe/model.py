@@ -235,8 +235,8 @@ def combined_deviation_mm(deviation_mm: F2, probe_mm: F1, outward: F2) -> F2:
 def printed_eq17_mm(deviation_mm: F2, probe_mm: F1, outward: F2, m: Reading17) -> F2:
     """Evaluate P (17), delta - Probe M, for either meaning of M, because the paper does not state which one it means.
 
-    ``"approach"`` (M = -n) equals `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way. The probe error is that of
-    the outward direction in both cases.
+    ``"approach"`` (M = -n) equals `combined_deviation_mm`. ``"outward"`` (M = n) moves the point the wrong way. In both cases the probe
+    error holds at the outward direction.
 
     Raises
     ------

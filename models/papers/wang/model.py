@@ -306,7 +306,7 @@ def tilt_bias_eq7(inc_mm: F1, tilt: dict[str, F1]) -> F2:
 
 
 def tilt_closure_mm(inc_mm: F1, tilt: dict[str, F1]) -> F1:
-    """Return the contribution of tilted mirrors to the closure ppp - npp - pnp - ppn per axis, mm, shape (3,), which reveals them."""
+    """Return the contribution of tilted mirrors to the closure ppp - npp - pnp - ppn per axis, mm, shape (3,); it reveals the tilts."""
     return np.asarray(inc_mm * (tilt["ppp"] - tilt["npp"] - tilt["pnp"] - tilt["ppn"]))
 
 

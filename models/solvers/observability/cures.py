@@ -39,11 +39,11 @@ ASIDE_MM = (100.0, 50.0)
 READINGS, RUNS = 130, 10
 """Most readings of a virtual run, and most runs repeated with another tool; a rank needs few."""
 SHORTEST_BAR_MM = 10.0
-"""No ball-bar is shorter."""
+"""Length of the shortest ball-bar."""
 MARGIN = 0.1
 """Fraction of the stroke between virtual runs and its ends."""
 SHOWN = 1e-7
-"""A hidden combination counts as shown from this effect on an addition's readings (unit columns) on; hidden means below 1e-9."""
+"""A hidden combination counts as shown if its effect on an addition's readings (unit columns) is at least this; hidden means below 1e-9."""
 
 
 @dataclass(frozen=True)
@@ -241,7 +241,7 @@ def _diagonals(machine: Machine, there: Present, order: int) -> Addition:
 def _bar_additions(machine: Machine, runs: tuple[RunData, ...], there: Present) -> list[Addition]:
     longer, aside = _other_tools(machine, runs)
     one = len({tuple(np.round(with_tool(machine, r.tool_mm).tool_mm, 6)) for r in runs}) == 1
-    length = "all runs used one tool length" if one else "no tool of these runs gives it a lever arm of its own"
+    length = "all runs used one tool length" if one else "no tool of these runs has a lever arm that separates these errors"
     beside = "in all runs the tool's end lay on one line, and a rotation about this line changes no reading" if one else length
     short = " with one tool length" if one else " with these tools"
     lined = " with tools that end on one line" if one else short
