@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 
 SAME_MM = 3.0
 NEAR_MM = 0.01
-"""Positions along a line that differ by less are the same."""
+"""Positions along a line that differ by less than this are the same."""
 U_REPEAT_MM = 1e-4
 """Repeatability of the helix figure after mounting the ball-bar again: assumed, not measured."""
 
@@ -55,10 +55,10 @@ def diagonal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> Verification
 def reversal_figure(run: RunData, turning_mm: Sequence[F1] = ()) -> VerificationFigure:
     """Return the size of the mean reversal value along a body diagonal, with its uncertainty (ISO 230-2, mean reversal value).
 
-    The curve is out minus back. Its scatter over the positions gives the uncertainty, with what a drift during the run adds to the mean:
-    the part of the curve that grows with the time between both readings. A reversal that varies along the diagonal enlarges both. Without
-    ``turning_mm`` the two ends, where the machine does not move between both readings, are left out if three other positions remain.
-    Parameters and errors as for `diagonal_figure`.
+    The curve is out minus back. The uncertainty combines the curve's scatter over the positions with the effect of a drift during the run,
+    which is the part of the curve that grows with the time between both readings. A reversal that varies along the diagonal enlarges both.
+    Without ``turning_mm`` the two ends, where the machine does not move between both readings, are left out if three other positions
+    remain. Parameters and errors as for `diagonal_figure`.
     """
     position, out, back, waited_s = _out_and_back(run, turning_mm)
     inner = slice(1, -1) if not turning_mm and len(position) >= 5 else slice(None)
@@ -111,9 +111,9 @@ def same_pose(a: RunData, b: RunData) -> bool:
 def pose_figure(run: RunData, known: JointSolution, *, with_machine: bool = False) -> VerificationFigure:
     """Return the rms deviation of the machine over an artefact whose form is known from a solution, after a fit of the pose.
 
-    ``with_machine``: what the machine's solution leaves of the deviation, instead of the whole deviation. Without a calibrated length the
-    common scale is fitted, too. Noise and the uncertainty of the form enlarge the rms: their expected share is subtracted from its square.
-    The uncertainty of the result follows from the same two.
+    ``with_machine``: the figure is the rms of the deviation minus the solution's own prediction. Without a calibrated length the common
+    scale is fitted, too. Noise and the uncertainty of the form enlarge the rms: their expected share is subtracted from its square. Noise
+    and form also give the uncertainty of the result.
     """
     p = run.points
     assert p is not None

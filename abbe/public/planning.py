@@ -28,7 +28,8 @@ class Plan:
     campaign : CampaignPlan
         What would be measured, in order: for `simulate`.
     U_mm : float
-        Expected worst expanded uncertainty (k = 2) of the deviation in the inner 80 % of the volume: a lower bound of the one from `solve`.
+        Expected worst expanded uncertainty (k = 2) of the deviation in the inner 80 % of the volume: a lower bound of what `solve` will
+        state.
     steps : tuple of (str, float, float)
         Each measurement in words, minutes until it is done, and expected worst U (k = 2) of the deviation afterwards, mm.
     not_observable : tuple of str

@@ -73,7 +73,7 @@ class Banks:
         self.generation = 1
         self._owner, self._lease_end_s = 0, 0.0
         if not (networks.load(0, self.plan.network) and networks.select(0) and networks.load(1, Network())):
-            raise RuntimeError("the control's network does not take values: is volumetric.hal the one of this bridge?")
+            raise RuntimeError("the control's network does not take values: does volumetric.hal belong to this bridge?")
 
     def write(self, bank: int, offset: int, words: list[int]) -> bool:
         """Write words into a bank; if that bank is the acting one or the words do not fit, do nothing and return False."""

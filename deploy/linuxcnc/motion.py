@@ -13,9 +13,10 @@ ALARM_NONE, ALARM_ESTOP = 0, 1
 _ARRIVED_MM = 1e-6
 _BEYOND_MM = 1e-9
 _SHORT_US, _LONG_US = 200_000, 2_000_000
-"""How long the control has to do nothing before a motion is over that was not seen to reach its target: short after a refusal, or at the
-target, else long. The control accepts a line, and looks idle until its servo thread has run; on a busy computer without real time nothing
-bounds how long that takes."""
+"""If a motion was not seen to leave and to reach its target, it counts as over once the control has done nothing for this time: the short
+one at the target or after a refusal, else the long one. The control accepts a line, and looks idle until its servo thread has run; on a
+busy computer without real time nothing bounds how long that takes.
+"""
 # Absolute, mm, mm/min, no tool offsets or cutter radius; corners blended within 1 um, and no point left out (Q0).
 _MODES = "G21 G90 G94 G17 G40 G49 G80"
 _HEADER = (_MODES, "G64 P0.001 Q0")
@@ -160,7 +161,7 @@ class Motion:
             self._idle(arrived=arrived, stopped=self._pending.aborted or self.latch is not None)
 
     def _idle(self, *, arrived: bool, stopped: bool) -> None:
-        """The control does nothing: the motion is over, or has not begun. A closed path begins where it ends."""
+        """End the motion of an idle control, unless it may not have begun: at the end of a closed path the position does not show which."""
         self._idle_us = self._now_us() if self._idle_us is None else self._idle_us
         enough_us = _SHORT_US if arrived or self.state.refused else _LONG_US
         if stopped or (arrived and self._left) or self._now_us() - self._idle_us >= enough_us:

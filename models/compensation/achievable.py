@@ -48,7 +48,7 @@ from abbe.models.uncertainty.sources import ErrorSources, error_sources, varianc
 NODES = 7
 RANK_TOLERANCE = 1e-7
 TOWARDS_ESTIMATE = 1e-6
-"""Weight of a motion's own estimate against the deviation; it decides only what the deviation does not determine."""
+"""Weight of a motion's own estimate against the deviation; it decides only combinations that the deviation leaves open."""
 
 
 @dataclass(frozen=True, eq=False)

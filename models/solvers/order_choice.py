@@ -49,7 +49,7 @@ def regions(runs: tuple[RunData, ...]) -> tuple[NDArray[np.intp], ...]:
 class OrderChoice:
     """Score of every model on left-out readings.
 
-    ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold, minus the one of the best
+    ``levels``: 0 for `RIGID6`, else the highest Legendre order. ``score``: mean log predictive density per fold, minus the mean of the best
     level. ``se``: standard error of this difference over the folds. ``chosen``: the simplest level within one standard error of the best.
     """
 

@@ -24,7 +24,9 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""A reading `OUTLIER_SIGMA` standard deviations off the prediction by its run's other readings is left out; at most `OUTLIER_SHARE` are."""
+"""`OUTLIER_SIGMA`: standard deviations from its run's other readings at which a reading is left out. `OUTLIER_SHARE`: largest share left
+out.
+"""
 
 
 @dataclass(frozen=True)
@@ -101,7 +103,7 @@ class Design:
 def scatter(design: Design, y: F1) -> tuple[float, NDArray[np.bool_]]:
     """Most probable noise of one run, mm, and a mask of its outliers, bool, shape (n,).
 
-    The noise is one of `SIGMA_GRID_MM`; each reading is compared with the prediction of all others of the run.
+    The noise is one of `SIGMA_GRID_MM`; each reading is compared with its prediction by the run's other readings.
     """
     drop = np.zeros(y.size, dtype=bool)
     while True:
@@ -113,7 +115,7 @@ def scatter(design: Design, y: F1) -> tuple[float, NDArray[np.bool_]]:
 
 
 def _against_the_rest(design: Design, y: F1) -> tuple[float, F1]:
-    """Most probable noise, and every reading's distance from the prediction of the others in standard deviations.
+    """Most probable noise, and every reading's distance from its prediction by the others, in standard deviations.
 
     Source: Rasmussen and Williams, Gaussian Processes, eqs 5.8 and 5.12.
     """
@@ -151,7 +153,7 @@ ON_SPHERE_MM = 1.5
 GROSS, GROSS_MM = 4.0, 2e-3
 """A run with cause "other" is reported only if its misfit exceeds both this multiple of the expected rms and this length."""
 SURE_SIGMA = 5.0
-"""A reading this many standard deviations from the prediction of all others of the campaign is an outlier, not a sign of a bad run."""
+"""A reading this many standard deviations from its prediction by all other readings is an outlier, not a sign of a bad run."""
 OUTLIER_MM = 0.1
 """Width of the range in which an outlier may lie."""
 LARGE_MM = 0.3

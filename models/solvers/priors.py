@@ -124,7 +124,7 @@ FIRST_LENGTH = LENGTHS[7]
 LENGTH_SPREAD = 0.4
 """Spread of the correlation lengths of one machine's motions: standard deviation of the logarithm, a factor of 1.5."""
 ENDS_SHARES = (0.1, 0.03)
-"""Share of a motion's variance that is largest at the ends of the stroke, where guideways sag and screws bend most: usual; least."""
+"""Usual and least share of the part of a motion's variance that is largest at the ends of the stroke, where guideways sag most."""
 ROUGH_LENGTH_MM = 30.0
 """Correlation length of the rough part of a translational motion: between the pitch of a screw and the carriage's length."""
 SMALLEST_BEND = 0.003

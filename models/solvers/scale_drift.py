@@ -1,4 +1,4 @@
-"""A scale that changes while the machine is measured, as of a ball screw that warms up: found in the residuals, stated, part of U.
+"""A scale that changes while the machine is measured, such as a ball screw that warms up: the residuals show the change, and U includes it.
 
 The solution's scales are averages over the campaign. A screw that grows by 6 um/m in that time has another scale before and after it, which
 no reading of the campaign shows. A bar or a laser that changes looks alike, so an axis is named only if it explains more than they do.
@@ -15,9 +15,9 @@ from abbe.models.solvers.engine import CampaignFit, CampaignProblem
 from abbe.models.solvers.fine import Score
 
 CLEAR = 8.0
-"""A change is stated if its log evidence exceeds no change, a bar and a laser that change by this much: four standard deviations."""
+"""A change is stated if its log evidence is this much above no change, a changing bar and a changing laser: four standard deviations."""
 FORM = 0.3
-"""Standard uncertainty of a change relative to it: its true course in time is none of those tried, and other things drift as well."""
+"""Relative standard uncertainty of a change, because its true course in time is none of those tried, and other things drift as well."""
 SCALES = ("EXX.1", "EYY.1", "EZZ.1")
 SETTLING = (0.15, 0.4, 1.0)
 """Time constants of the courses that are tried beside a straight line, in durations of the campaign."""
@@ -35,8 +35,8 @@ class ScaleDrift:
 def scale_drifts(problem: CampaignProblem, fit: CampaignFit) -> tuple[ScaleDrift, ...]:
     """The change of one scale that explains the residuals best and clearly better than a bar or a laser that changes; else none.
 
-    ``change`` is the mean over several courses in time, by their evidence; ``u`` holds their spread, and `FORM`. Two scales that change at
-    once are not told: the clearer one is stated.
+    ``change`` is the mean over several courses in time, by their evidence; ``u`` holds their spread, and `FORM`. If two scales change at
+    once, only the clearer one is stated.
     """
     courses, (names, columns) = _courses(problem), _columns(problem)
     if not courses or not names:
@@ -68,7 +68,7 @@ def drift_factor(problem: CampaignProblem, drifts: tuple[ScaleDrift, ...]) -> F2
 
 
 def _courses(problem: CampaignProblem) -> tuple[F1, ...]:
-    """Courses from 0 at the first to 1 at the last reading, less their mean: a straight line, and what settles."""
+    """Courses from 0 at the first to 1 at the last reading, less their mean: a straight line, and exponentials that settle (`SETTLING`)."""
     t_s = np.concatenate([run.t_s for run in problem.runs])
     span_s = float(np.ptp(t_s))
     if span_s <= 0.0:

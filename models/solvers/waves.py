@@ -32,8 +32,9 @@ of their neighbourhood in fine steps."""
 APART = 4
 """Least number of coarse steps between the two periods of a pair: closer periods are one period with a changing amplitude."""
 LIKELY, MOST = 60, 700
-"""`LIKELY`: number of pairs whose neighbourhood is searched finely. `MOST`: largest number of coarse frequencies from which pairs are
-formed, those that are best alone."""
+"""`LIKELY`: number of pairs whose neighbourhood is searched finely. `MOST`: largest number of coarse frequencies that form pairs: those
+with the best evidence alone.
+"""
 BLOCK = 16
 """Number of first frequencies of pairs that are taken at once; their arrays stay in the cache."""
 SCATTER_MM = tuple(float(v) for v in np.geomspace(3e-5, 4e-3, 9))
@@ -162,10 +163,11 @@ def _pairs(
 
 
 def gain_of_pairs(waves: NDArray[np.float64], h: F1, information: F2) -> F2:
-    """Log evidence of every pair of frequencies minus that of none, shape (f, f), valid above the diagonal.
+    """Log evidence of every pair of frequencies minus the log evidence of no wave, shape (f, f), valid above the diagonal.
 
     ``waves`` (f, n, k): displacements by the k waves of each frequency. The waves are scaled so that each frequency alone has the unit
-    matrix as posterior precision; what a second frequency adds then needs only the k x k blocks across, row by row of blocks.
+    matrix as posterior precision; the gain by a second frequency then needs only the k x k blocks across; they are computed one row of
+    blocks at a time.
     """
     f, n, k = waves.shape
     back = np.linalg.inv(np.linalg.cholesky(waves.transpose(0, 2, 1) @ (information @ waves) + np.eye(k)))

@@ -441,7 +441,7 @@ def _calibration(solution: JointSolution, r: Response, inputs: StatedInputs) -> 
 
 
 def _travel(run: RunData) -> F1:
-    """Return the distance along the beam from the first record, mm; a wrong wavelength causes a proportional error. 0: ball-bar."""
+    """Return the distance along the beam from the first record, mm, zero for a ball-bar; a wrong wavelength causes a proportional error."""
     if run.beam is None:
         return np.zeros(run.deviation_mm.size)
     return np.asarray((run.axes_mm - run.axes_mm[0]) @ run.beam)
@@ -450,7 +450,7 @@ def _travel(run: RunData) -> F1:
 def _temperature(solution: JointSolution, inputs: StatedInputs) -> list[Source]:
     """Return the uncertain scale temperature as a source: positioning error of each axis, alpha u_T times travel from the stroke's start.
 
-    Its term is that of Legendre order 1, which is twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
+    The term has Legendre order 1, so its value is twice the fraction of the stroke (`abbe.models.geometry.bases.term_values`).
     """
     slope = inputs.u_scale_temperature_k * inputs.scale_expansion_per_k
     if slope == 0.0:

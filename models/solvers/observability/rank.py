@@ -44,8 +44,9 @@ NOTHING = 1e-7
 """Entries of unit vectors below this are rounding."""
 Status = Literal["observed", "weak", "not observable"]
 OBSERVED, WEAKLY_OBSERVED = 0.9, 0.1
-"""Share of information from data: from 0.9 on (u at most 0.32 of the prior standard deviation) a parameter is observed, below 0.1 (u at
-least 0.95 of it) not observable, in between weak."""
+"""Share of a parameter's information that comes from the readings: with 0.9 or more (u at most 0.32 of the prior standard deviation) it is
+observed, below 0.1 (u at least 0.95 of the prior standard deviation) not observable, in between weak.
+"""
 CORRELATED = 0.9
 NODES = 41
 
