@@ -33,7 +33,7 @@ class DeviceInfo:
 class BarSample(NamedTuple):
     """One ball-bar sample (docs/protocols/ballbar.md). A plain tuple: thousands are made every second.
 
-    ``status``: bits of `abbe.drivers.api.BarFlag`; the driver of another box converts that box's status bits to them.
+    ``status``: bits of `abbe.drivers.api.BarFlag`, into which the driver of another box converts its status bits.
     """
 
     seq: int
@@ -72,8 +72,8 @@ class BarTap(Protocol):
 class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
-    ``status``: bits of `abbe.drivers.api.LaserFlag`; the driver of another instrument converts its status bits to them. ``refractivity``:
-    n - 1 of air. Values of the air that the instrument does not measure are NaN (`air_doc`).
+    ``status``: bits of `abbe.drivers.api.LaserFlag`, into which the driver of another instrument converts its status bits.
+    ``refractivity``: n - 1 of air. Values of the air that the instrument does not measure are NaN (`air_doc`).
     """
 
     host_s: float
@@ -399,7 +399,7 @@ class LaserFlag(IntFlag):
 _SYNC, _OVERRUN, _ZEROED = int(BarFlag.SYNC), int(BarFlag.OVERRUN), int(LaserFlag.ZEROED)
 _BAR_OUT = int(BarFlag.OUT_OF_RANGE | BarFlag.NO_BAR)
 _BAR_INVALID = _BAR_OUT | _OVERRUN
-_BAR_REASONS = ((int(BarFlag.OUT_OF_RANGE), "out of range"), (_OVERRUN, "samples lost before it"), (int(BarFlag.NO_BAR), "no bar"))
+_BAR_REASONS = ((int(BarFlag.OUT_OF_RANGE), "out of range"), (_OVERRUN, "samples lost just before"), (int(BarFlag.NO_BAR), "no bar"))
 BAR_REASONS = tuple(reason for _, reason in _BAR_REASONS)
 """All reasons for an invalid ball-bar reading that the box can report."""
 _BEAM_GONE = int(LaserFlag.BEAM_LOST | LaserFlag.NO_REFLECTOR)

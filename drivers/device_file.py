@@ -178,7 +178,7 @@ class DeviceFile(DeviceTable):
     source: str = Field(default="", description="manual and chapter that this file was written from")
     air: Literal["no light", "compensated", "vacuum"] = Field(
         default="no light",
-        description="of a displacement: it uses no light; light, and the device corrects for the air; light, not corrected (refused)",
+        description="of a displacement sensor: uses no light; uses light, corrected for the air; uses light, not corrected (refused)",
     )
     modbus: ModbusTable | None = None
     line: LineTable | None = None

@@ -119,7 +119,7 @@ def _truth(argv: Sequence[str]) -> int:
     parser.add_argument("--nodes", type=int, default=9, help="grid nodes per axis")
     parser.add_argument("--arrows", action="store_true", help="add grid and deviation vectors")
     parser.add_argument("--plane", type=float, nargs=5, metavar=("X0", "X1", "Y0", "Y1", "Z"), help="add the rms in this plane, mm")
-    parser.add_argument("--inside-mm", type=float, default=0.0, help="body diagonals of the box so far inside the strokes (default: 0)")
+    parser.add_argument("--inside-mm", type=float, default=0.0, help="distance of the body diagonals from the stroke ends (default: 0)")
     options = parser.parse_args(argv)
     scenario = _scenario(options)
     if options.seed is not None:

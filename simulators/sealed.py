@@ -72,7 +72,7 @@ def rms_norm(vectors: F) -> float:
 
 
 def body_diagonals_um(machine: Machine, correction: Correction = no_correction, inside_mm: float = 0.0) -> dict[str, float]:
-    """Return the range (max - min) of the deviation along each body diagonal of the box that lies so far inside the strokes, µm."""
+    """Return the range (max - min) of the deviation along each body diagonal of the box ``inside_mm`` inside the strokes, µm."""
     low, high = machine.geometry.low_mm + inside_mm, machine.geometry.high_mm - inside_mm
     result = {}
     for name, signs in DIAGONALS.items():
@@ -94,7 +94,7 @@ def best_nine_tables_rms_um(machine: Machine, nodes: int = FINE_NODES) -> float:
 def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool = False, inside_mm: float = 0.0) -> dict[str, object]:
     """Return all error figures of the machine with a correction (µm); ``arrows`` adds grid and deviation vectors for plotting.
 
-    ``inside_mm``: of `body_diagonals_um`.
+    ``inside_mm``: as in `body_diagonals_um`.
     """
     points = grid(machine, nodes)
     rest = without_rigid_motion(points, deviation(machine, points, correction))
@@ -137,7 +137,7 @@ def truth(
 ) -> dict[str, object]:
     """Return the true errors of a scenario's machine; ``image`` is a compensation image as big-endian bytes, None for no correction.
 
-    ``plane``: adds `plane_rms_um` of this box; ``inside_mm``: of `body_diagonals_um`.
+    ``plane``: box of which `plane_rms_um` is added; ``inside_mm``: as in `body_diagonals_um`.
     """
     draws = draw_machine(scenario)
     machine = Machine(Geometry(scenario.machine), draws)

@@ -127,7 +127,7 @@ class Site:
             self._resting = False
 
     def _asked(self) -> None:
-        """The host asks the controller."""
+        """Bring the world up to date because the host asks the controller; note the time."""
         self.advance()
         self._asked_s, self._heard_s = self._at_s, self._last_s
 

@@ -101,7 +101,7 @@ def _wrong_by_driver(sample: Sample, taken: list[Sample], asked_s: float) -> Dev
 
 def _fresh(file: DeviceFile | None) -> DeviceCheck:
     if file is None:
-        return DeviceCheck("freshness", PASSED, "no sample came twice; whether its numbers come from the device depends on its driver")
+        return DeviceCheck("freshness", PASSED, "no sample came twice; only the driver knows whether the numbers come from the device")
     stamp = next((name for name in ("counter", "time") if name in file.values), None)
     if stamp is not None:
         return DeviceCheck("freshness", PASSED, f"its {stamp} is checked with every reading")

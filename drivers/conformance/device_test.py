@@ -64,7 +64,7 @@ class _Rest:
     close: Mapping[str, float]
 
     def off(self, sample: Sample) -> dict[str, float]:
-        """Values of a sample that cannot be those at rest."""
+        """Return the values of a sample that differ too much from the values at rest."""
         return {key: value for key, value in sample.values.items() if not abs(value - self.values[key]) <= self.close[key]}
 
 

@@ -41,7 +41,7 @@ class Proxy:
     def __init__(self, late_s: float) -> None:
         self._late_s = late_s
         self.fault: Fault | None = None
-        """Applied to the next reply, then None again."""
+        """Fault of the next reply; None once it was applied."""
         self.done = 0
         """Number of faults that were applied."""
         self.cuts = False

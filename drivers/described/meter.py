@@ -152,7 +152,7 @@ class DescribedMeter:
         await self.source.close()
 
     async def _command(self, command: Command, operation: str) -> None:
-        """Send a command; it acts on the readings after the one that is shown now."""
+        """Send a command, and remember the present reading: the command acts on later readings only."""
         await self.source.command(command, operation)
         await asyncio.sleep(self.file.limits.update_s or 0.0)
         self._not_before = self._counted(await self.source.snapshot())
@@ -175,7 +175,7 @@ class DescribedMeter:
                 )
 
     def _counted(self, snapshot: CountSnapshot) -> int:
-        """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else ours."""
+        """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else counted here."""
         if snapshot.epoch != self._epoch:
             self._epoch, self._zero_mm = snapshot.epoch, None
         soon, self._seen_s = snapshot.host_s - self._seen_s < SOON_S, snapshot.host_s
@@ -186,7 +186,7 @@ class DescribedMeter:
     def _step(self, name: str, raw: float, *, soon: bool) -> float:
         """Add the change of a count, which may wrap, to its total, and return the change.
 
-        Raises Rebooted if the count went back. If it is read ``soon`` after the last time, a change above half its range counts as back.
+        Raises Rebooted if the count went back. ``soon``: it was read a moment ago, so a rise by more than half of its range is a step back.
         """
         value, before = self.file.values[name], self._raw.get(name)
         step = raw if before is None else raw - before

@@ -23,8 +23,8 @@ LEAD_IN_MM = 1.0
 class Conditions:
     """Measuring conditions: standard deviation of one reading (``*_noise_mm``), share and size of outliers, errors of the instruments.
 
-    ``bar_length_sd_mm``: standard deviation of each bar's length error (one bar per nominal radius). ``wavelength_sd``: that of the laser's
-    relative scale error. ``pause_s``: time between two runs. ``drift``: whether the machine's thermal drift acts.
+    ``bar_length_sd_mm``: standard deviation of each bar's length error (one bar per nominal radius). ``wavelength_sd``: standard
+    deviation of the laser's relative scale error. ``pause_s``: time between two runs. ``drift``: whether the machine's thermal drift acts.
     """
 
     bar_noise_mm: float = 0.5e-3

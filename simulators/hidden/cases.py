@@ -20,7 +20,7 @@ from abbe.simulators.hidden.rig import BentMachine, PerfectMachine, Rig
 from abbe.simulators.hidden.track import Track
 
 INDISTINCT = 20.0
-"""Chi-square deficit of a rival's best trace below which it is indistinguishable from the effect."""
+"""A rival cannot be distinguished from the effect if its best trace leaves a chi-square below this."""
 COMPONENTS = "XYZABC"
 DRIFT_S = (1500.0, 3000.0, 6000.0)
 Function = Callable[[Track], F]

@@ -58,7 +58,7 @@ def test_motion_is_refused_unless_0_1_2_11_are_clear_and_3_4_5_set():
 
 @pytest.mark.parametrize("word", [*range(64), 0xFF00 | 1 << 3, 0x0100])
 def test_the_bar_says_that_it_reads(word: int):
-    """Bit 0 out of range, 2 samples lost before it, 3 sync, 4 no bar; bits 8 to 15 number its settings."""
+    """Bit 0 out of range, 2 samples lost just before, 3 sync, 4 no bar; bits 8 to 15 number its settings."""
     assert api.on_path(word) == bool(word >> 3 & 1)
     assert api.bar_is_out(word) == bool(word & 1 or word >> 4 & 1)
     assert api.overran(word) == bool(word >> 2 & 1)
