@@ -78,7 +78,7 @@ class OpcUaControl(ListenedControl):
         return list(await self._ask("identify", self._nodes[axis].get_properties()))
 
     async def status(self) -> ControllerStatus:
-        """Read all nodes in one request; the time is that of this computer at the arrival.
+        """Read all nodes in one request; the time is this computer's, at the arrival.
 
         Raises
         ------

@@ -48,7 +48,7 @@ class ListenedControl:
         return await self.source.identify()
 
     async def status(self) -> ControllerStatus:
-        """Read position and states; the time is that of this computer at the arrival.
+        """Read position and states; the time is this computer's, at the arrival.
 
         Raises
         ------

@@ -1,4 +1,4 @@
-"""Converts Modbus registers, in any of the four byte orders of devices, to values, and units of the wire to those of `abbe.drivers.api`."""
+"""Converts Modbus registers, in any of the four byte orders of devices, to values, and units of the wire to ours (`abbe.drivers.api`)."""
 
 from __future__ import annotations
 

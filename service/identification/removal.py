@@ -1,7 +1,7 @@
 """Subtract from a campaign's readings what a new table must not correct: side effects of the table in force, and effects of other remedies.
 
 Everything that a table in force does beyond smooth corrections is subtracted. The table is known exactly, from the controller or the
-database. Lost motion changes the moves that it commands, and interpolation and rounding add to them: both effects are subtracted. The
+database. Lost motion, interpolation and rounding change the moves that the table commands: these effects are subtracted. The
 machine's lost motion is solved first, preferably without step diagonals, in which the table alone moves axes that are commanded to rest.
 A table that is not available widens the covariance instead (`with_unknown_table`).
 """
@@ -164,14 +164,14 @@ points, unit of their entries; and the seed."""
 
 
 def with_unknown_table(solution: JointSolution) -> JointSolution:
-    """Return the same solution; its covariance includes an unknown table in force."""
+    """Return the solution with a covariance that includes an unknown table in force."""
     r = response(solution)
     effect = r.design.T @ (r.weight[:, None] * reading_patterns_mm(solution))
     return widened(solution, "table", r.covariance @ effect / np.sqrt(TABLES))
 
 
 def reading_patterns_mm(solution: JointSolution) -> F2:
-    """Return the effect of each drawn table on the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
+    """Return what each drawn table does to the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
     rng = np.random.default_rng(SEED)
     machine, terms = solution.machine, smooth_terms(ORDER)
     x, y, z = (max(2, round(length / SPACING_MM)) for length in machine.length_mm)
@@ -189,7 +189,7 @@ def reading_patterns_mm(solution: JointSolution) -> F2:
 
 
 def effect_mm(data: tuple[RunData, ...], out: RemovedTable) -> F1:
-    """Return the effect of a table on the readings beyond smooth corrections, mm, run by run, shape (readings,)."""
+    """Return what a table does to the readings beyond smooth corrections, mm, run by run, shape (readings,)."""
     return np.concatenate([_on_run_mm(run, out.force) - _on_run_mm(run, out.stays) for run in data])
 
 

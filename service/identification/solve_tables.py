@@ -78,9 +78,7 @@ def scale_free(found: Assessment) -> Assessment:
         The scales are not the least certain part of the solution.
     """
     if found.scale_free is None:
-        raise TableRefused(
-            "these runs determine the scales no worse than the rest: leave nothing out", "run again and omit --without-scale"
-        )
+        raise TableRefused("these runs determine the scales as well as the rest: keep the scales", "run again and omit --without-scale")
     return found.scale_free
 
 

@@ -183,7 +183,7 @@ def _origin(content: Content, test: AxisReadings | None, machine: Doc | None) ->
 
 
 def _beside(contents: Sequence[Content], tests: Sequence[AxisReadings | None]) -> Doc:
-    """Return readings that no run holds, and stated figures; empty without any."""
+    """Return readings that no run holds, and stated figures; empty if there are none."""
     readings = [
         {
             "kind": "angle" if test.quantity == "angle" else "mean",

@@ -126,7 +126,7 @@ class FileRows:
     rows: list[tuple[int, list[str]]]
 
     def headings(self, heading: int) -> list[str]:
-        """Cells of the row of headings; numbers from 1 without one."""
+        """Cells of the row of headings; numbers from 1 if there is no such row."""
         if heading:
             found = next((cells for line, cells in self.rows if line == heading), None)
             if found is None:

@@ -80,9 +80,9 @@ async def run_guided_campaign(context: InvestigationContext, source: RecipeSourc
 
 
 async def investigate_guided(context: InvestigationContext, source: RecipeSource, alarm: Alarm, note: Note, *, resume: str = "") -> None:
-    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments. Raises as both.
+    """Look for the cause of an alarm as `investigate` does, with a person who mounts the instruments.
 
-    ``resume``: the alarm's interrupted campaign, if its complete runs are kept.
+    ``resume``: the alarm's interrupted campaign, if its complete runs are kept. Raises what `investigate` and `run_guided_campaign` raise.
     """
 
     async def measured(context: InvestigationContext, alarm: Alarm, note: Note) -> Alarm:

@@ -22,7 +22,7 @@ class InterruptedCampaign:
     """An interrupted campaign.
 
     ``rate_hz``: ball-bar samples per second; ``complete``: number of its complete runs, which are kept; ``until_utc``: when it was
-    interrupted; ``alarm``: the alarm whose cause it looks for, 0 without one.
+    interrupted; ``alarm``: the alarm whose cause it looks for, 0 if none.
     """
 
     name: str

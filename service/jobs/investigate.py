@@ -144,7 +144,7 @@ def _search(context: InvestigationContext, campaign: str) -> tuple[int | None, F
 def _objections(finding: Finding, store: Store, machine: str) -> AlarmFacts:
     """Return the objections to tables.
 
-    ``against``: the objections as text, empty without any. ``rms_um``: rms of what the model leaves of the readings beyond noise.
+    ``against``: the objections as text, empty if there are none. ``rms_um``: rms of what the model leaves of the readings beyond noise.
     ``unnamed``: whether something is missing and no effect was found for it. An effect that no table corrects is an objection unless the
     machine's model contains it: effects of the model are subtracted from the readings before tables are made.
     """
@@ -183,7 +183,7 @@ async def _proposed(context: InvestigationContext, alarm: Alarm, note: Note) -> 
 async def make_proposal(context: InvestigationContext, campaign: str, agree: Callable[[Predicted], None], by: str = "") -> StoredProposal:
     """Solve a measured campaign and store the result as a proposal, based on the controller's table in force.
 
-    ``agree``, ``by`` and the errors are those of `proposals.make`; devices can also fail.
+    ``agree``, ``by`` and the errors: as in `proposals.make`; a device can also fail.
     """
     site, store = context.site, context.store
     with lock_machine(site.urls.cnc):

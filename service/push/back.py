@@ -167,7 +167,7 @@ def _with_table_off(f: PushFacts, known: PushKnowledge, truth: Truth) -> Operati
 
 
 def _mixed(content: bytes, images: tuple[bytes, bytes], size: int) -> bool:
-    """Whether each chunk of a table equals that of the new or of the old table."""
+    """Whether each chunk of a table equals the same chunk of the new or of the old table."""
     return bool(content) and all(
         content[at : at + size] in [i[: len(content)][at : at + size] for i in images] for at in range(0, len(content), size)
     )
@@ -184,7 +184,7 @@ def _begin_restaging(truth: Truth, bank: int) -> Operation:
 
 
 def _ours(content: bytes, base: bytes, size: int) -> bool:
-    """Whether each chunk of a bank equals that of the old table or is still blank (zeros)."""
+    """Whether each chunk of a bank equals the same chunk of the old table or is still blank (zeros)."""
     chunks = [(content[at : at + size], base[at : at + size]) for at in range(0, len(base), size)]
     return len(content) == len(base) and all(is_ == wanted or not any(is_) for is_, wanted in chunks)
 

@@ -140,7 +140,7 @@ def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
 
 
 NOT_YET = -1
-"""A number that no entry has stated yet: no controller reports it, so no comparison with it succeeds."""
+"""Stands for a number that no entry has stated yet. No controller reports it, so every comparison with it fails."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +229,7 @@ _NO_ORDER: Doc = {
     "chunk_words": 0,
 }
 _KEYS = {"semantic_digest": "meaning", "base_semantic_digest": "base_meaning"}
-"""Facts whose key in the journal's entries has another name."""
+"""Facts that the journal's entries store under another name."""
 _FIELDS = tuple((one.name, _KEYS.get(one.name, one.name), _CONVERTED.get(one.name)) for one in fields(PushFacts))
 _SNAPSHOT = frozenset({
     "machine", "image", "crc", "meaning", "limits", "owner", "level", "attended", "chunk_words", "boot", "gen", "map",

@@ -202,7 +202,7 @@ def _binding(c: Candidate, context: CandidateContext) -> Iterator[str]:
     if c.length_unit != "mm":
         yield f"UNIT: lengths are in {c.length_unit!r}, not in mm"
     if c.base_crc != context.active_crc:
-        yield f"BASE: measured with table {c.base_crc:08X}, active is {context.active_crc:08X}"
+        yield f"BASE: measured with table {c.base_crc:08X}, but table {context.active_crc:08X} is active"
 
 
 def _form(c: Candidate, context: CandidateContext) -> Iterator[str]:
@@ -226,7 +226,7 @@ def _column_form(column: Column, context: CandidateContext) -> str:
     if column.reverse_mm and len(column.reverse_mm) != n:
         return f"SIZE: {len(column.reverse_mm)} reverse values, {n} positions"
     if not all(b > a for a, b in pairwise(position)):
-        return "POSITIONS: they do not increase strictly"
+        return "POSITIONS: the positions do not increase strictly"
     low, high = context.travel_mm[column.moved]
     if not low - 1e-6 <= position[0] <= position[-1] <= high + 1e-6:
         return f"TRAVEL: {position[0]:g} to {position[-1]:g} mm, the axis goes from {low:g} to {high:g} mm"
@@ -244,11 +244,11 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     low, high = limits.temperature_c
     newest_s = e.ended_s if e.last_s is None else e.last_s
     if not context.now_s - limits.age_h * 3600.0 <= e.ended_s <= newest_s <= context.now_s:
-        yield f"STALE: measured {(context.now_s - e.ended_s) / 3600.0:.1f} h ago, allowed are 0 to {limits.age_h:g} h"
+        yield f"STALE: measured {(context.now_s - e.ended_s) / 3600.0:.1f} h ago, the limits are 0 to {limits.age_h:g} h"
     if e.machine_mark != context.machine_mark:
         yield "CHANGED: the control was restarted during or since the measurement: measure again"
     if not low <= e.temperature_c[0] <= e.temperature_c[1] <= high:
-        yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, allowed are {low:g} to {high:g} °C"
+        yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, the limits are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:
         yield f"RUNS: {e.run_count}, but {limits.runs} are needed"
     if drift := drift_reason(e.drift_mm, limits):
@@ -274,7 +274,7 @@ def _reach(c: Candidate, context: CandidateContext, limits: PushLimits) -> Itera
         if not beyond <= limits.beyond:
             yield (
                 f"REACH: the runs moved {axis} from {low:.0f} to {high:.0f} mm, but the table corrects {beyond:.0%} of the stroke beyond "
-                f"that, allowed are {limits.beyond:.0%} ([limits] table_beyond_percent)"
+                f"that, the limit is {limits.beyond:.0%} ([limits] table_beyond_percent)"
             )
 
 
@@ -282,7 +282,7 @@ def drift_reason(drift_mm: float, limits: PushLimits) -> str:
     """Return the reason why the drift (rms residual of the solution in a newer run) is too large; empty if it is not."""
     if drift_mm <= limits.drift_mm:
         return ""
-    return f"DRIFT: a newer run deviates from the solution by {drift_mm * 1e3:.1f} µm rms, allowed are {limits.drift_mm * 1e3:.1f} µm"
+    return f"DRIFT: a newer run deviates from the solution by {drift_mm * 1e3:.1f} µm rms, the limit is {limits.drift_mm * 1e3:.1f} µm"
 
 
 def promise_reason(before_mm: float, after_mm: float, u_mm: float, limits: PushLimits) -> str:
@@ -367,14 +367,14 @@ def size_reasons(p: Sequence[float], v: Sequence[float], active: Sequence[float]
     ):
         k = max(range(len(sizes)), key=lambda n: abs(sizes[n]), default=0)
         if sizes and abs(sizes[k]) > limit:
-            allowed = f"allowed are {limit * 1e3:.1f} µm" + (f" ([limits] {key})" if key else "")
+            allowed = f"the limit is {limit * 1e3:.1f} µm" + (f" ([limits] {key})" if key else "")
             yield f"{word}: {abs(sizes[k]) * 1e3:.1f} µm at {p[k]:.1f} mm, {allowed}"
 
 
 def together_reasons(axis: str, total_mm: float, limits: PushLimits) -> Iterator[str]:
     """Yield the reason if the largest values of an axis' three tables add up to too much; ``total_mm``: their sum."""
     if total_mm > limits.value_mm:
-        allowed = f"allowed are {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
+        allowed = f"the limit is {limits.value_mm * 1e3:.1f} µm ([limits] table_value_um)"
         yield f"VALUE: the tables of {axis} together reach {total_mm * 1e3:.1f} µm, {allowed}"
 
 
@@ -389,7 +389,7 @@ def _size(column: Column, active: tuple[float, ...], limits: PushLimits, lsb_mm:
     yield from size_reasons(p, v, active, limits)
     slopes = [abs(d - c) / (b - a) for c, d, a, b in zip(v, v[1:], p, p[1:], strict=False)]
     if max(slopes) > limits.slope:
-        yield f"SLOPE: {max(slopes) * 1e3:.2f} µm/mm, allowed are {limits.slope * 1e3:.2f} µm/mm"
+        yield f"SLOPE: {max(slopes) * 1e3:.2f} µm/mm, the limit is {limits.slope * 1e3:.2f} µm/mm"
     if abs(v[0]) > ZERO_MM:
         yield f"REFERENCE: {v[0] * 1e3:.2f} µm at the reference instead of 0"
     if max(abs(x / lsb_mm - round(x / lsb_mm)) for x in v) > WHOLE:

@@ -86,7 +86,7 @@ def whole_run(store: Store, record: RunRecord, *, full: bool = True) -> Run:
 
 
 def run_document(run: Run, record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc:
-    """Return a run as an ``abbe-run/1`` document; an imported run as it was, including unknown keys."""
+    """Return a run as an ``abbe-run/1`` document; an imported run as it was imported, including unknown keys."""
     imported = _imported(record, chunks)
     if imported is None:
         return run.to_document()
@@ -156,7 +156,7 @@ def _check_documents(record: RunRecord) -> None:
 
 
 def _imported(record: RunRecord, chunks: Sequence[ChunkRecord]) -> Doc | None:
-    """Return an imported run exactly as it was; None for a measured one."""
+    """Return an imported run exactly as it was imported; None for a measured run."""
     imported = record.start_doc.get("imported")
     return None if imported is None else dict(imported) | {"columns": unpack_columns(chunks)}  # the key keeps its place
 

@@ -27,7 +27,7 @@ ROUND = 0.5
 
 
 def reached_mm(runs: Sequence[Run]) -> tuple[tuple[float, float], ...]:
-    """Return the lowest and highest position of each axis in the valid readings of these runs, mm; empty without any."""
+    """Return the lowest and highest position of each axis in the valid readings of these runs, mm; empty if there are none."""
     places = [r.columns.q_mm[r.columns.valid] for r in runs]
     if not sum(map(len, places)):
         return ()
@@ -38,7 +38,7 @@ def reached_mm(runs: Sequence[Run]) -> tuple[tuple[float, float], ...]:
 def reached_text(reached: Mapping[str, tuple[float, float]]) -> str:
     """Return the positions that runs reach as text; empty if they are not known."""
     ends = ", ".join(f"{axis} {low:.0f} to {high:.0f}" for axis, (low, high) in reached.items())
-    return f"{ends} mm, beyond it is assumed" if ends else ""
+    return f"{ends} mm; the map beyond is assumed" if ends else ""
 
 
 def helix_axis(stated: str, at_mm: F2) -> int | None:

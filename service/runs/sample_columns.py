@@ -160,7 +160,7 @@ def _holds(samples: BarSamples, what: Callable[[int], bool]) -> npt.NDArray[np.b
 
 
 def _ends(holds: npt.NDArray[np.bool_]) -> tuple[int, int] | None:
-    """Return the first and the last row for which a mask holds, None without any."""
+    """Return the first and the last row for which a mask holds; None if there is none."""
     first = int(np.argmax(holds)) if holds.size else 0
     return (first, holds.size - 1 - int(np.argmax(holds[::-1]))) if holds.any() else None
 
@@ -286,7 +286,7 @@ def _check_durations(device_us: npt.NDArray[np.int64], path_us: tuple[int, int],
     if abs(device_s - controller_s) > tolerance_s:
         raise MeasurementFault(
             "feed changed during the run, or its first or last samples were lost: "
-            f"it took {device_s:.3f} s by the ball-bar, {controller_s:.3f} s by the controller",
+            f"the path took {device_s:.3f} s by the ball-bar, {controller_s:.3f} s by the controller",
             "measure the run again with a steady connection and the feed override at 100 %",
         )
     if abs(device_s - planned_s) > tolerance_s:

@@ -360,6 +360,6 @@ class _ApprovedPush(_AlarmJob):
         return await super().end(outcome)
 
     async def interrupted(self) -> None:
-        """Record the state that the push journal shows; if time runs out, the next start does it."""
+        """Record the state that the push journal shows; if there is no time left, the next start of the service records it."""
         if self._is_begun:
             await self._manager.interrupted(self._found, self._after)

@@ -71,7 +71,7 @@ def found_late(schedule: Schedule, slot: datetime, late: timedelta) -> SlotOutco
     allowed = span(timedelta(seconds=schedule.grace_s))
     how = span(late)
     return SlotOutcome(
-        f"missed: {how} late", "SCH-001", f"{_slot(schedule.name, slot)} was missed: found {how} late, allowed are {allowed}"
+        f"missed: {how} late", "SCH-001", f"{_slot(schedule.name, slot)} was missed: it was found {how} late, the limit is {allowed}"
     )
 
 

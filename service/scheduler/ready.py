@@ -109,7 +109,7 @@ class Ready:
             if readings.air_c is None:
                 return "the air temperature is not measured: the machine file has no laser"
             if not low <= readings.air_c <= high:
-                return f"the air is at {readings.air_c:.1f} C, allowed are {low:g} to {high:g} C"
+                return f"the air is at {readings.air_c:.1f} C, the limits are {low:g} to {high:g} C"
         return ""
 
     def active_min(self) -> float:

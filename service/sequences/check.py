@@ -186,7 +186,7 @@ def dry_run_campaign(machine: Machine, plan: CampaignPlan, max_feed_mm_min: floa
         feed = fastest(test)
         if feed > max_feed_mm_min:
             raise StrokeError(
-                f"test {test.label}: would move at {feed:g} mm/min, allowed are {max_feed_mm_min:g}",
+                f"test {test.label} would move at {feed:g} mm/min, the limit is {max_feed_mm_min:g}",
                 "lower the recipe's feed or raise feed_mm_min under [limits]; nothing has moved",
             )
     return tuple(dry_run(machine, test) for test in plan.tests)

@@ -131,7 +131,8 @@ def air_trouble(reading: LaserReading, window_c: tuple[float, float] | None) -> 
         return None
     low, high = window_c
     return TemperatureOutside(
-        f"the air has {reading.air_temp_c:.1f} C, allowed are {low:g}..{high:g} C", "wait until the air is within these limits, then go on"
+        f"the air has {reading.air_temp_c:.1f} C, the limits are {low:g}..{high:g} C",
+        "wait until the air is within these limits, then go on",
     )
 
 

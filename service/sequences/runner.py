@@ -322,8 +322,9 @@ class Runner:
         return {}
 
     async def _touched(self, step: TouchFeature, watch: Watch) -> dict[str, Any]:
-        """Touch a feature. Its time is the end of the touches, its temperature that of the air if there is a laser. After a pause, which
-        a person may have used to touch stylus or artefact, first touch the references, then begin this one anew.
+        """Touch a feature. Its time is the end of the touches; its temperature is the air's, if there is a laser.
+
+        In a pause a person may have touched stylus or artefact: then first touch the references, and this feature anew.
         """
         record = None
         while record is None:

@@ -129,7 +129,7 @@ class _Crcs:
 
     @property
     def begun(self) -> tuple[int, int] | None:
-        """The table found in force and the one to be written, of the first entry of a push; None if the entry names no table."""
+        """CRCs in the first entry of a push: of the table found in force and of the table to be written; None if it names no table."""
         if self.crc is None:
             return None
         if self.base_crc is None:

@@ -347,7 +347,7 @@ def outcome_of(journal: Journal, names: TableNames = TableNames()) -> JobOutcome
         case PushState.REJECTED:
             return JobOutcome("refused", f"{name}: nothing was written: {'; '.join(known.reasons) or why}")
         case PushState.ABORTED:
-            return JobOutcome("failed", f"{name}: {names.old} is in force, {names.it} never was: {why}")
+            return JobOutcome("failed", f"{name}: {names.old} is in force, {names.it} never came into force: {why}")
         case PushState.ACCEPTED:
             new = known.accepted_crc == known.crc
             return JobOutcome("kept" if new else "rolled back", f"{name}: a person vouches for {names.new if new else 'another table'}")

@@ -103,7 +103,7 @@ class Alarm(AlarmHead):
 
     @property
     def outcome(self) -> str:
-        """Latest result of the work on the alarm as a sentence; empty without any."""
+        """Latest result of the work on the alarm as a sentence; empty if there is none."""
         return self.work[-1].facts.text if self.work else ""
 
 

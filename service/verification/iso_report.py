@@ -126,7 +126,7 @@ def _axis(out: Evaluated, test: AxisTest, budget: tuple[ScaleBudget, StatedInput
 
 
 def _axis_ways(out: Evaluated, test: AxisTest, stated: tuple[ScaleBudget, StatedInputs], reduction: Reduction) -> Positioning:
-    """Add the figures of every way to evaluate a test; return those of the first."""
+    """Add the figures of every way to evaluate a test; return the figures of the first way."""
     budget, known = stated
     label = f"{test.name} {test.setup}"
     _tell(out, f"{AT_20}, axis {label}", reduction)

@@ -179,7 +179,7 @@ def incomparable(before: VerificationFigures, after: VerificationFigures, pushed
         return "a figure is not a number"
     if pushed_crc is not None and after.tables != {pushed_crc}:
         used = ", ".join(sorted("unrecorded" if crc is None else f"{crc:08X}" for crc in after.tables)) or "unrecorded"
-        return f"it was measured with table {used}, but table {pushed_crc:08X} was brought into force"
+        return f"the machine was measured with table {used}, but table {pushed_crc:08X} was brought into force"
     if before.air_c is None or after.air_c is None:
         return "the air temperature is not known"
     low, high = min(before.air_c[0], after.air_c[0]), max(before.air_c[1], after.air_c[1])
@@ -234,7 +234,7 @@ def judge(value_um: float, u_um: float, limit_um: float) -> Verdict:
 
 
 def overall(verdicts: list[Verdict]) -> Verdict:
-    """The worst of several verdicts; "cannot tell" without any."""
+    """The worst of several verdicts; "cannot tell" if there are none."""
     if "fail" in verdicts:
         return "fail"
     return "cannot tell" if "cannot tell" in verdicts or not verdicts else "pass"

@@ -23,7 +23,7 @@ class FunctionSet:
     """Several smooth functions of one position, evaluated together.
 
     Attributes: ``amplitude``, ``wavenumber`` (rad/mm), ``phase`` of shape (m, FEATURES); ``height``, ``centre_mm``,
-    ``width_mm`` of shape (m, BUMPS); ``offset`` and ``slope_per_mm`` of shape (m,): a line added to each function, ``offset`` at ``start_mm``.
+    ``width_mm`` of shape (m, BUMPS); ``offset`` and ``slope_per_mm`` of shape (m,): a line added to each, ``offset`` at ``start_mm``.
     """
 
     amplitude: F

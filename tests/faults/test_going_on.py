@@ -127,7 +127,7 @@ async def test_an_e_stop_never_goes_on_by_itself(place):
 async def test_air_outside_the_window_stops_a_run(place):
     b, store = place
     plan = CampaignPlan("c", (small("Linear"),))
-    with pytest.raises(TemperatureOutside, match=r"allowed are 30\.\.31 C"):
+    with pytest.raises(TemperatureOutside, match=r"the limits are 30\.\.31 C"):
         await measure(b.session, store, replace(b.site, watching=Watching((30.0, 31.0))), plan)
 
 

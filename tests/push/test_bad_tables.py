@@ -85,7 +85,7 @@ def test_a_table_beyond_what_was_measured_needs_the_word_of_the_machine_file() -
     made = signed(replace(candidate, evidence=replace(candidate.evidence, reached_mm=reached)))
     (reason,) = reasons_against(made, context, LIMITS)
     assert reason.startswith(
-        "REACH: the runs moved X from 0 to 416 mm, but the table corrects 28% of the stroke beyond that, allowed are 25%"
+        "REACH: the runs moved X from 0 to 416 mm, but the table corrects 28% of the stroke beyond that, the limit is 25%"
     )
     assert "table_beyond_percent" in reason
     assert reasons_against(made, context, replace(LIMITS, beyond=0.28)) == []

@@ -69,7 +69,7 @@ WAYS = {
     ),
     "measured with another table": (
         lambda s: Push(s, *s.here, s.tables(), alter=of_the_old_table),
-        "cannot tell whether the machine is better: it was measured with table 0000002A",
+        "cannot tell whether the machine is better: the machine was measured with table 0000002A",
     ),
     "warmer between before and after": (
         lambda s: Push(s, *s.here, s.tables(), lambda: s.sims.ask("air", plus_c=3.0)),

@@ -1,7 +1,7 @@
 """Abbe's types in OPC UA, and the companion specifications that they derive from.
 
 With the nodesets of DI, IA, Machinery (OPC 40001-1) and MachineTool (OPC 40501-1) at hand, the machine is a MachineToolType in the folder
-``Machines``, and events are NotificationEventTypes. Without them the same types derive from those of the standard. An alarm is no
+``Machines``, and events are NotificationEventTypes. Without them the same types derive from the standard's types. An alarm is no
 AlertType, because clients may acknowledge an AlertType, and here nothing can be written. OPC 40210 is not used, because no package holds
 its nodeset.
 """

@@ -206,7 +206,7 @@ def to_path(recipe: CupTest, path: tuple[Point, ...], machine: Machine) -> list[
     """Return the steps to the first point of a ball-bar path: mount, change the bar or move along the sphere, and approach.
 
     No move passes the cup straight: from the centre, and after a change of the bar, the machine moves over the pole and along the sphere.
-    ``link_mm`` lies on this sphere or (``change_bar``) on that of the previous bar; a straight move from there would cut the sphere.
+    ``link_mm`` lies on this sphere or, with ``change_bar``, on the previous bar's sphere; a straight move from there would cut the sphere.
     """
     up = pole_of(recipe)[1]
     centre, feed = np.array(recipe.centre_mm), recipe.feed_mm_min

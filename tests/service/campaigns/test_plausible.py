@@ -55,7 +55,7 @@ IMPOSSIBLE = [
 CANNOT_BE_KEPT = [
     ("quick-check", "quick-chekc", "schedule 'weekly': there is no recipe 'quick-chekc' - did you mean 'quick-check'?"),
     ("quick-check", "quick-check at 300 Hz", "there is no recipe 'quick-check at 300 Hz'"),
-    ("temperature_c = [18, 24]", "feed_mm_min = 1000", "schedule 'weekly': test check-helix: would move at 6000 mm/min"),
+    ("temperature_c = [18, 24]", "feed_mm_min = 1000", "schedule 'weekly': test check-helix would move at 6000 mm/min"),
     ('laser = "modbus+tcp://127.0.0.1:9"', "", "schedule 'weekly': this needs a laser for test check-ppp, and the machine file names none"),
     ('cnc = "modbus+tcp://127.0.0.1:9"', "", "schedule 'weekly': this needs a controller for all motion"),
     ("fixture+tcp://127.0.0.1:9", "fixture+console:", "schedule 'weekly': the fixture is the console, which is unattended"),

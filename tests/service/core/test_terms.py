@@ -180,7 +180,7 @@ MONDAY_8, MONDAY_20 = utc(2026, 6, 1, 8), utc(2026, 6, 1, 20)
         (Needs(idle=True), MONDAY_8, DeviceReadings(status(READY | Condition.MOVING)), "not idle: an axis moves"),
         (Needs(idle=True), MONDAY_8, None, "the devices cannot be read"),
         (Needs(air=True), MONDAY_8, DeviceReadings(status(), 20.0), ""),
-        (Needs(air=True), MONDAY_8, DeviceReadings(status(), 25.5), "the air is at 25.5 C, allowed are 18 to 24 C"),
+        (Needs(air=True), MONDAY_8, DeviceReadings(status(), 25.5), "the air is at 25.5 C, the limits are 18 to 24 C"),
         (Needs(air=True), MONDAY_8, DeviceReadings(status(), None), "the air temperature is not measured"),
     ],
 )

@@ -108,5 +108,5 @@ def test_a_bar_of_unknown_length_alone_is_said_without_the_common_scale_too():
 def test_bar_and_laser_together_know_the_scale_and_nothing_is_left_out():
     found = assessed("joint")
     assert solution_of(found).uncertainty.without_scale is None
-    with pytest.raises(TableRefused, match="determine the scales no worse than the rest"):
+    with pytest.raises(TableRefused, match="determine the scales as well as the rest"):
         scale_free(found)

@@ -147,7 +147,7 @@ def test_a_stroke_exceeded_names_axis_amount_and_remedy_before_anything_moves():
 
 
 def test_a_feed_over_the_limit_is_refused():
-    with pytest.raises(StrokeError, match="6000 mm/min, allowed are 3000"):
+    with pytest.raises(StrokeError, match="6000 mm/min, the limit is 3000"):
         dry_run_campaign(MACHINE, verification(MACHINE), 3000.0)
 
 

@@ -53,7 +53,7 @@ def test_what_cannot_be_run_says_why() -> None:
     slow = Rehearsals(replace(TOLD, max_feed_mm_min=500.0), ("quick-check",)).run("quick-check", 100)
     assert slow is not None
     assert not slow.startable
-    assert "allowed are 500" in slow.trouble
+    assert "the limit is 500" in slow.trouble
     assert slow.runs == ()
 
 
