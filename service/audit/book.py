@@ -408,7 +408,7 @@ def login() -> str:
 
 
 def by_whom() -> str:
-    """The account that orders a table from this command line, as the journal names it."""
+    """How the journal of pushes names the account of this command line."""
     return f"{login()}, by the command line"
 
 

@@ -342,7 +342,7 @@ def _readings(run: Run) -> list[CampaignIssue]:
 
 
 def _too_large(label: str, y: NDArray[np.float64], valid: NDArray[np.bool_]) -> list[CampaignIssue]:
-    """Return the issue of too large deviations: many mean another unit, some a lost beam or bar; robust weights handle single outliers."""
+    """Return the issue if too many deviations are too large: another unit, or a lost beam or bar. Robust weights handle single outliers."""
     size = np.where(valid, np.abs(y), 0.0)
     count, of, largest = int((size > LARGEST_MM).sum()), int(valid.sum()), float(size.max(initial=0.0))
     if largest > NO_READING_MM:

@@ -28,7 +28,7 @@ from abbe.service.errors import AbbeError, CaptureFault, DiskFull, StoreError
 from abbe.service.storage.store import Store
 
 GROUP_S = 0.01
-"""Longest time, s, that a sample waits for the sync that it shares with later samples; an earlier slow sync is part of this time."""
+"""Longest time, s, that a sample waits to share a sync with later samples; the wait for an earlier slow sync counts."""
 MAX_PENDING = 8192
 HANG_S = 30.0
 

@@ -15,7 +15,7 @@ from abbe.service.storage.store import Store
 from abbe.service.verification.alarm_states import NO_ALARM
 
 Begun = Callable[[], Awaitable[None]]
-"""Called at least once when this process has locked the machine: from then on this is an attempt."""
+"""Called at least once when this process has locked the machine: from then on the push counts as attempted."""
 
 
 @dataclass(frozen=True, slots=True)

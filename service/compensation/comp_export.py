@@ -273,7 +273,7 @@ def _notes(comp: Compensation, control: ControlModel, *, fresh: bool, turned: bo
         out.append(f"lost motion is in no table: set the control's own backlash parameter ({values})")
     for key in formats_in(control):
         form = FORMATS[key]
-        out.append(f"{form.name}: {form.sign.evidence}; acts after: {form.live}")
+        out.append(f"{form.name}: {form.sign.evidence}; to activate: {form.live}")
         if form.sign.sure:
             continue
         if turned is not None:
@@ -299,7 +299,7 @@ def expected(known: Identified, control: ControlModel, reference_mm: F1 | None =
 
 
 def alike_mm(control: ControlModel) -> float:
-    """Return the largest difference, mm, that rounding can make between read and expected tables; several error motions add up."""
+    """Return the largest difference, mm, that rounding can make between read and expected tables; it adds up over error motions."""
     return (MOTIONS_ADD_UP if control.motions_format else 1.0) * 0.51 * control.unit_mm + 1e-6
 
 

@@ -130,7 +130,7 @@ async def push(context: PushContext, admission: Admission, before: list[Run]) ->
 
 
 async def _push(context: PushContext, admission: Admission, made: StoredProposal, before: list[Run]) -> Correction:
-    """Push an admitted proposal and verify it. Any interlock ends the push: an unverified table must not wait in force."""
+    """Push an admitted proposal and verify it. Any interlock ends the push: an unverified table must not stay in force meanwhile."""
     session, store, proposed, precheck = context.session, context.store, made.proposed, admission.precheck
     site = replace(context.site, watching=replace(context.site.watching, suspending=Suspending()))
     context = replace(context, site=site)

@@ -34,8 +34,8 @@ from abbe.service.verification.verify import VerificationFigures
 
 TRUTH: Literal["sealed truth of the simulator"] = "sealed truth of the simulator"
 DIAGONALS_TOLD = (
-    "A body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. Measured and true, it begins and ends "
-    "10 mm inside the strokes."
+    "A body diagonal is the range of the mean of both ways (M_d of ISO 230-6), without reversal. Both figures, measured and true, begin "
+    "and end 10 mm inside the strokes."
 )
 ALL_OBSERVABLE = (
     "nothing in the model: these runs determine every parameter. Errors outside the model remain possible: look at the residuals"

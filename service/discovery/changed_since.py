@@ -158,7 +158,11 @@ def _compare(store: Store, before: _Before, campaign: Campaign, found: Sequence[
 
 
 def _compared(store: Store, before: _Before, campaign: Campaign, found: Sequence[EffectFound]) -> ChangedSince:
-    """Compare, after subtracting the effects that the old solution had subtracted and the campaign's own thermal and instrument effects."""
+    """Compare the campaign with the old solution.
+
+    Two kinds of effects are first subtracted from its readings: those that the old solution had subtracted, and the campaign's own thermal
+    and instrument effects.
+    """
     left = remove_table(campaign, campaign_table(store, campaign).table)
     if before.version is not None:
         book = version(store, campaign.site.name, before.version).book.effects

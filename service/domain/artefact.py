@@ -27,7 +27,7 @@ def _check_rotation(matrix: tuple[Point, Point, Point]) -> tuple[Point, Point, P
 
 
 class Touched:
-    """Name of a feature of the artefact, or of the qualification sphere (``u_sphere_mm`` is not None), that is or was touched."""
+    """A feature of the artefact, or the qualification sphere (``u_sphere_mm`` is not None), that is or was touched."""
 
     __slots__ = ()
     feature: str

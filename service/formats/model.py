@@ -92,14 +92,17 @@ class Lattice:
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that computes the deviation by its own chain (rule G)."""
+    """ERROR motions (ISO 230-1, not corrections; mm, rad) for a control that computes the deviation by its own kinematic chain."""
 
     machine: Machine
     curves: Mapping[str, AxisCurve]
     squareness_rad: Mapping[str, float]
 
     def correction_at(self, axes_mm: F2) -> F2:
-        """Return minus the deviation by rule G, mm, shape (n, 3); squareness counts travel from the start of the stroke."""
+        """Return minus the deviation that the chain gives (rule G of docs/explanation/conventions.md), mm, shape (n, 3).
+
+        Squareness counts travel from the start of the stroke.
+        """
         values = np.zeros((axes_mm.shape[0], 3, 6))
         for name, curve in self.curves.items():
             axis, component = PLACES[name]

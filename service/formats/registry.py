@@ -90,7 +90,7 @@ FORMATS: dict[str, Format] = {
             siemens_eec.SIGN,
             siemens_eec.write,
             siemens_eec.read,
-            "load with MD32700 = 0, then 1, reset, reference",
+            "load with MD32700 = 0, then set it to 1, reset, reference the axis",
         ),
         Format(
             "siemens-cec",
@@ -99,7 +99,7 @@ FORMATS: dict[str, Format] = {
             siemens_cec.SIGN,
             siemens_cec.write,
             siemens_cec.read,
-            "load with MD32710 = 0, then 1; SD41300 switches tables",
+            "load with MD32710 = 0, then set it to 1; SD41300 switches tables",
         ),
         Format(
             "fanuc-pitch",

@@ -278,7 +278,7 @@ def test_the_commands_plan_write_and_dry_run(tmp_path):
     assert dry.exit_code == 0, dry.output
     assert "of machine time" in dry.output
     assert read_recipe(out)[0] in dry.output  # the campaign is called what the recipe is called
-    assert "temperature of the scales, known to 0.2 K" in found.output
+    assert "temperature of the scales (standard uncertainty 0.2 K" in found.output
     assert "note: hemispheres open along +Z" in found.output
 
 

@@ -19,7 +19,7 @@ that goes too far has e > 0 and needs the correction −e. How to export: [Make 
 **Verified by execution**: the rule was seen on the real control (LinuxCNC 2.9, positions read back; specification, "Controllers", 1.4 and
 1.5). **By manual**: read in documents only; no such control was at hand.
 
-| format | what it holds | points of a table | sign of the number | evidence | acts after |
+| format | what it holds | points of a table | sign of the number | evidence | how to activate |
 |---|---|---|---|---|---|
 """
 _PROOF = """
