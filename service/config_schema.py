@@ -379,7 +379,7 @@ class Web(ConfigTable):
     key: str = Field(default="", description="private key of the certificate, PEM file")
     behind_tls: bool = Field(
         default=False,
-        description="a reverse proxy on this computer terminates TLS, keeps Host and appends to X-Forwarded-For; its name is in names",
+        description="a reverse proxy on this computer terminates TLS, keeps Host and appends to X-Forwarded-For; names holds its host name",
     )
     memory_mb: int = Field(
         default=1024,
@@ -527,7 +527,7 @@ class MachineFile(ConfigTable):
         if (room := self.calibration.room_temperature_c) is not None:
             low, high = self.limits.temperature_c
             if self.devices.laser:
-                raise ValueError("room_temperature_c is stated beside a laser, expected one of both: its sensor reads the air")
+                raise ValueError("room_temperature_c is stated beside a laser, whose sensor reads the air: expected only one of them")
             if not low <= room[0] <= room[1] <= high:
                 raise ValueError(f"room_temperature_c is outside of [limits] temperature_c, expected inside {low:g} to {high:g}")
         for entry in self.schedule:

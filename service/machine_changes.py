@@ -30,7 +30,8 @@ RIGHTS: Mapping[str, Permission] = MappingProxyType(
         "calibration": Permission.APPROVE,
     }
 )
-"""Sections that can be changed, with the right for it. Addresses, geometry, store, page, keys and users' rights cannot."""
+"""Sections that the page can change, each with the right that a user needs. It cannot change addresses, geometry, store, page, keys and
+rights."""
 Looser = Literal["more", "higher", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
 LOOSER: Mapping[str, Looser] = MappingProxyType(
     {
@@ -137,7 +138,8 @@ def changed(loaded: LoadedMachine, edits: Sequence[FileEdit]) -> LoadedMachine:
 
 
 def _value(edit: FileEdit) -> Any:
-    """The wanted value; only where a last day belongs, the text of a day becomes a day. Raises ValueError or RecursionError."""
+    """The wanted value. Only in keys that hold a last day, the text of a day becomes a date. Raises ValueError, RecursionError,
+    ConfigError."""
     value = json.loads(edit.value)
     if LOOSER.get(edit.key) != "later" or not isinstance(value, str):
         return value

@@ -347,7 +347,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
 
 
 def _continued(setup: ServiceSetup, earlier: Readiness) -> ServiceSetup:
-    """A setup whose service knows when the machine was at work before: a machine does not cool down because its file has changed."""
+    """A setup that passes on when the machine was last at work: a machine does not cool down because its file has changed."""
 
     def ready(clock: Clock) -> Readiness:
         made = setup.ready(clock)

@@ -146,7 +146,8 @@ def _folder(keep: Path | None) -> Path:
 
 @contextmanager
 def work_folder(folder: Path, keep: Path | None) -> Iterator[Path]:
-    """Yield the folder for database and device links: ``folder``, which must hold no other demonstration; without it a temporary folder."""
+    """Yield the folder for database and device links: ``folder``, which must hold no other demonstration; without ``keep`` a temporary
+    one."""
     if keep is None:
         with tempfile.TemporaryDirectory(prefix="abbe-") as name:
             yield Path(name)

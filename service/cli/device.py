@@ -71,7 +71,9 @@ def try_device(
     faults: Annotated[
         bool, typer.Option("--faults/--no-faults", help="Also simulate late, doubled, corrupted and missing replies.")
     ] = True,
-    out: Annotated[Path | None, typer.Option(metavar="FILE.json", help="Keep the report; tested=FILE.json in the URL uses it.")] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="FILE.json", help="Write the report to a file; tested=FILE.json in the device's URL names it.")
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Test identity, rate, freshness, noise, sign, scale, quality bits and bad replies of a device; exit code 1 if a check failed."""

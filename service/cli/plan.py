@@ -91,7 +91,8 @@ def _plan_poses(site: Site, artefact: Path, minutes: float, out: Path | None, *,
 
 
 def _check_targets(targets: tuple[Path | None, ...], sources: tuple[Path | None, ...]) -> None:
-    """Refuse an output file that cannot be written, is also an input, or is named twice; call it before the half minute of planning."""
+    """Refuse an output file that cannot be written, is also an input, or is named twice. Call this before planning, which takes half a
+    minute."""
     from abbe.service.errors import ConfigError
 
     taken = [p.resolve() for p in sources if p is not None]

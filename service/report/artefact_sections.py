@@ -30,7 +30,8 @@ def artefact_sections(joint: JointSolution) -> list[Section]:
     top = colour_top(np.concatenate([np.linalg.norm(s.deviation_um, axis=2).ravel() for s, _ in slices]))
     pictures = [_picture(one, at, top, k) for k, (one, at) in enumerate(slices)]
     frame = deviation_of_artefacts(joint, slices[0][0].grid_mm.reshape(-1, 3))[2]
-    caption = f"Actual minus commanded; {frame}. Ring: not larger than U (95 %). Only where the artefact was touched."
+    ring = "Ring: the deviation is not larger than U (95 %). Shown only where the artefact was touched."
+    caption = f"Actual minus commanded; {frame}. {ring}"
     return [Section("Deviation where the artefact lay", [PictureBlock(caption, pictures), _poses(joint)])]
 
 

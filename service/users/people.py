@@ -31,7 +31,7 @@ SHORTEST, LONGEST_PASSWORD = 12, 256
 LEAST_DIFFERENT = 5
 PIN, LEAST_DIFFERENT_DIGITS = re.compile(r"[0-9]{6,12}"), 3
 PIN_ROLES = frozenset({Role.VIEWER, Role.OPERATOR})
-"""Roles whose users may log in by PIN, which is easier to guess than a password: none that proposes, approves or manages."""
+"""Roles whose users may log in by PIN. A PIN is easier to guess than a password, so these roles may not propose, approve or manage."""
 MOST_WRONG_PINS = 10
 """Wrong PINs in a row, at all browsers and over restarts, after which the PIN is removed."""
 T = TypeVar("T")

@@ -13,7 +13,7 @@ from starlette.types import Message, Receive, Scope
 from abbe.service.web.problems import problem
 
 LONGEST_B = 64 * 1024
-"""Default limit of a changing request; a route may have its own (``max_body_size``)."""
+"""Default size limit, bytes, of the body of a changing request; a route may have its own (``max_body_size``)."""
 
 MOST_FIELDS = 8
 

@@ -136,7 +136,7 @@ def render(env: Environment, status: Status, past: Sequence[Verification]) -> st
 
 
 def figures(past: Sequence[Verification]) -> list[str]:
-    """Figures with a column and a plot: those with a limit or, if none has one, the first `SHOWN_FIGURES`."""
+    """Up to `SHOWN_FIGURES` figures with a column and a plot: those with a limit or, if none has one, the first ones."""
     judged = dict.fromkeys(key for check in past for key in check.values if check.limits.get(key) is not None)
     return list(judged or dict.fromkeys(key for check in past for key in check.values))[:SHOWN_FIGURES]
 

@@ -92,7 +92,7 @@ def _value_scale(points: Sequence[Point]) -> _PixelScale:
 
 
 def _step(length: float) -> float:
-    """A round step that divides ``length`` into four to eight parts."""
+    """A round step that divides ``length`` into two to five parts."""
     rough = max(length, 1e-9) / 5
     power = 10.0 ** math.floor(math.log10(rough))
     return next(power * factor for factor in (1, 2, 5, 10) if power * factor >= rough)

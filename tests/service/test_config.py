@@ -184,7 +184,11 @@ BAD = [
     ('name = "VMC-1"', "name = ", "not valid TOML: .*line 2"),
     ("[limits]", "[calibration]\nroom_temperature_c = [20, 21]\n[limits]", "room and room_temperature_c belong together, expected both"),
     ("[limits]", f"{ROOM}[20, 21.2]\n[limits]", "room_temperature_c is 20 to 21.2, expected at most 1 K"),
-    ("[limits]", f"{ROOM}[20, 21]\n[limits]", "room_temperature_c is stated beside a laser, expected one of both"),
+    (
+        "[limits]",
+        f"{ROOM}[20, 21]\n[limits]",
+        "room_temperature_c is stated beside a laser, whose sensor reads the air: expected only one of them",
+    ),
     (LASER, f"{ROOM}[16.5, 17.5]\n", r"room_temperature_c is outside of \[limits\] temperature_c, expected inside 18 to 24"),
 ]
 

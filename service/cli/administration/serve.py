@@ -277,7 +277,7 @@ def _campaigns(named: str, site: Site, folder: Path) -> tuple[str, ...]:
 
 
 def _beside(machine_file: Path, name: str) -> str:
-    """Return a file's path relative to the machine file's folder, or the absolute path as it is; empty stays empty."""
+    """Return the absolute path of a file that is named relative to the machine file's folder; an empty name stays empty."""
     return str(machine_file.resolve().parent / name) if name else ""
 
 

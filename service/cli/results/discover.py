@@ -188,7 +188,7 @@ def _run_live(
 
 
 def _measured(store: Store, site: Site, campaign: Campaign, addition: LiveAddition, *, accept_table: bool) -> float:
-    """Measure the runs of an addition that are still missing. Return the seconds to wait if it is too early to measure, else 0."""
+    """Measure the missing runs of an addition to a campaign. Return the seconds to wait if it is too early to measure, else 0."""
     from abbe.service.cli.measure import ready_session
     from abbe.service.cli.running import display, run_job
     from abbe.service.discovery.discover_live import measure_added

@@ -119,7 +119,7 @@ def show(
         print_json(document)
         return
     pieces = found.timing.pieces
-    extra = {"pieces": ", ".join(f"{one.readings} of {one.run}" for one in pieces) + " and its own"} if pieces else {}
+    extra = {"pieces": ", ".join(f"{one.readings} of {one.run}" for one in pieces) + " and the run's own"} if pieces else {}
     extra |= {"judged": why} if (why := not_judged(found)) else {}
     setup = {f"setup.{key}": value for key, value in found.setup.document.items()}
     print_table(

@@ -192,7 +192,8 @@ def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
 
 
 def _solved(store: Store | None, chosen: Campaign, wanted: _SolveRequest) -> tuple[Assessment, dict[str, Any]]:
-    """Solve a campaign without its known effects; return the assessment of the solution and its document. Progress goes to stderr."""
+    """Solve a campaign after subtracting its known effects; return the assessment of the solution and its document. Progress goes to
+    stderr."""
     from abbe.service.cli.running import display
     from abbe.service.config import load_machine
     from abbe.service.domain.progress import Progress

@@ -18,7 +18,7 @@ Array = NDArray[np.float64]
 
 WIDTH, SIDE, LEFT, TOP, BOTTOM = 620.0, 420.0, 74.0, 52.0, 104.0
 MARGIN = 0.11
-"""Margin for the magnified errors around the strokes, as a share of the longer one."""
+"""Margin for the magnified errors around the strokes, as a share of the longer stroke."""
 HANDY = (1.0, 1.25, 1.5, 2.0, 2.5, 3.0, 4.0, 5.0, 6.0, 8.0, 10.0)
 PLANES = {"XY": (0, 1, 2), "XZ": (0, 2, 1), "YZ": (1, 2, 0)}
 """Axes to the right, upwards and through the paper."""
@@ -61,7 +61,7 @@ def colour_top(length: Array) -> float:
 
 
 def magnification(span_mm: float, longest_um: float) -> float:
-    """Round factor at which the longest error spans a tenth of the volume."""
+    """Round factor at which the longest error spans at most a tenth of ``span_mm``."""
     return round_down(0.1 * span_mm / (longest_um * 1e-3)) if longest_um > 0.0 and span_mm > 0.0 else 1.0
 
 

@@ -57,7 +57,7 @@ async def once(store: Store, request: Request, key: str, body: BaseModel, work: 
 
 
 def _answer(work: Callable[[], BaseModel]) -> tuple[int, str]:
-    """Do the work; return status and body of its answer. A refusal is such an answer; an unavailable store is raised."""
+    """Do the work; return status and body of its answer. A refusal is an answer, too; an error with a status from 500 on is raised."""
     try:
         return 200, work().model_dump_json()
     except AbbeError as error:

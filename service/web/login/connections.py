@@ -38,7 +38,7 @@ class TimeLimitedProtocol(H11Protocol):
         self.silent_since_s = self.loop.time()
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Make room, and wait for a request."""
+        """Wait for a request; above `MOST_CONNECTIONS` drop the connection that has been silent longest."""
         super().connection_made(transport)
         self._watch()
         if len(self.connections) > MOST_CONNECTIONS:

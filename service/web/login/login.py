@@ -187,7 +187,7 @@ def _with_pin_here(auth: Authenticator, request: Request) -> list[str]:
 
 
 def _set_device_cookie(auth: Authenticator, request: Request, answer: Response, user: UserRecord, device: str) -> None:
-    """Mark a browser after a login by password; a known browser gets a new mark."""
+    """Mark a browser after a login by password; the mark of a known browser is renewed."""
     made, life_s = auth.people.new_device(user, device), int(DEVICE_LIFE.total_seconds())
     tls = is_tls(request, behind_tls=auth.behind_tls)
     answer.set_cookie(auth.device_cookie(user.name), made, life_s, path="/login", httponly=True, samesite="strict", secure=tls)

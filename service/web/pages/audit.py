@@ -110,7 +110,7 @@ def _who(who: str) -> str:
 
 
 def _target(record: AuditEntry) -> str:
-    """The target without numbers of jobs and addresses, which only programs need; of a command's file the name."""
+    """The target without numbers of jobs and addresses, which only programs need; a file of a command appears by its name alone."""
     frame, text = current(), _JOB.sub("", record.target)
     if text.startswith("/") and record.action.startswith("abbe "):
         return PurePath(text).name

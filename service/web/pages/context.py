@@ -81,7 +81,7 @@ Text = Annotated[str, Query(max_length=200), AfterValidator(can_be_stored)]
 
 
 def zone_of(status: Status) -> tzinfo:
-    """Time zone of the screens: that of the first schedule, else UTC."""
+    """Time zone of the screens: that of the schedule that is due first, else UTC."""
     return ZoneInfo(status.next_due[0].timezone) if status.next_due else UTC
 
 

@@ -33,7 +33,7 @@ _HEADER = re.compile(r"""(?i)((?:cookie|authori[sz]ation)(?:\\*["']?\s*[:=]|\\*[
 _SCHEME = re.compile(r"((?i:\bbearer)\s+|\bBasic\s+(?=[A-Za-z0-9+/_-]{8}))[^\s\"']+")
 _BEFORE = rf"""(?:{_NAMED}|\bpass)[\w-]*(?:\\*["']?\s*[:=]|\\*["']\s*,)\s*|\babbe[_-][\w.-]*="""
 _QUOTED = re.compile(rf"""(?i)({_BEFORE})[bru]{{0,2}}(\\*)(["']).*?(?:(?<!\\)\2\3|(?=[\r\n])|\Z)""")
-"""A quoted value ends at the same quotes, escaped as the opening ones, or where its line is cut off."""
+"""A quoted value ends at its closing quotes, escaped like the opening ones, or at the end of its line."""
 _BARE = re.compile(rf"""(?i)({_BEFORE})(?!\*\*\*)\S+""")
 
 
