@@ -61,7 +61,8 @@ def papers(
         Path | None, typer.Option("--html", metavar="FILE", help="Also write a report with the papers' pictures.", show_default=False)
     ] = None,
 ) -> None:
-    """Compute the numbers that the four papers print, show both side by side, and state why some cannot be computed."""
+    """Compute the numbers that the four papers print, show printed and computed numbers side by side, and say why some cannot be
+    computed."""
     from abbe.service.reference.paper_results import TITLES, document, results
 
     found = results(TITLES if paper is None else (paper.value,))

@@ -63,7 +63,9 @@ def list_models(
 
 @model.command("show")
 def show_model(
-    version: Annotated[int | None, typer.Argument(metavar="VERSION", help="Default: the current one.", show_default=False)] = None,
+    version: Annotated[
+        int | None, typer.Argument(metavar="VERSION", help="Number of a version. Default: the current one.", show_default=False)
+    ] = None,
     of: OfOption = None,
     db: DbOption = None,
     machine: MachineOption = None,
@@ -93,8 +95,10 @@ def show_model(
 
 @model.command("diff")
 def diff_models(
-    first: Annotated[int, typer.Argument(metavar="FIRST", help="Version.", show_default=False)],
-    second: Annotated[int | None, typer.Argument(metavar="SECOND", help="Default: the current one.", show_default=False)] = None,
+    first: Annotated[int, typer.Argument(metavar="FIRST", help="Number of a version.", show_default=False)],
+    second: Annotated[
+        int | None, typer.Argument(metavar="SECOND", help="Number of a version. Default: the current one.", show_default=False)
+    ] = None,
     of: OfOption = None,
     db: DbOption = None,
     machine: MachineOption = None,
@@ -183,7 +187,9 @@ def _doc(found: ModelVersion) -> dict[str, Any]:
 
 
 def effects(
-    name: Annotated[str | None, typer.Argument(metavar="NAME", help="One effect; without it all are listed.", show_default=False)] = None,
+    name: Annotated[
+        str | None, typer.Argument(metavar="NAME", help="Name of an effect; without it all are listed.", show_default=False)
+    ] = None,
     as_json: JsonOption = False,
 ) -> None:
     """Show the catalogue of physical effects: how each looks, what shows it, how large it usually is, what to do about it."""

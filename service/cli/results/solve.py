@@ -278,7 +278,7 @@ def solve_all(  # noqa: PLR0913 - every one of them is an option of the command
     machine: MachineOption = None,
     as_json: JsonOption = False,
 ) -> None:
-    """Solve many campaigns of a database again, each exactly as abbe solve does; exit code 1 if one was refused."""
+    """Solve many campaigns of a database again, each as abbe solve does with this model; exit code 1 if one was refused."""
     from abbe.service.errors import NotStored
 
     url = database_url(db, machine)
