@@ -52,7 +52,7 @@ def agreements(
     """Test how every holdout run agrees with its prediction by a solution without effects; the worst run first.
 
     A run's whitened residual is tested twice, reading by reading and in block sums (sensitive to smooth deviations), weighted by the
-    inverse covariance of noise and prediction together. The ratio of its mean square to that of the fitted runs of the same instrument
+    inverse covariance of noise and prediction together. Its mean square over the mean square of the fitted runs of the same instrument
     follows an F distribution, with fewer degrees of freedom where readings are correlated or have long tails. p is twice the smaller p of
     both tests.
 

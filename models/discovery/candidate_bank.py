@@ -172,7 +172,7 @@ def _gains(gram: np.ndarray, rhs: F2, own: F2, prior_sd: F2) -> F1:
 
 
 def _ridge(own: np.ndarray, prior_sd: np.ndarray) -> np.ndarray:
-    """What is added to the diagonal of a Gram matrix, in the shape of ``own``."""
+    """Return the amounts to add to the diagonal of a Gram matrix, in the shape of ``own``."""
     return np.asarray(prior_sd**-2.0 + VISIBLE_SHARE * own + 1e-30)
 
 
@@ -241,7 +241,7 @@ class Taken:
 
 
 def gain_of(problem: WhitenedProblem, pick: Pick, taken: Taken) -> float:
-    """Reduction of chi-square by one pick beside others; the problem remembers it, as a repeated search asks for the same gains."""
+    """Reduction of chi-square by one pick beside others; the result is cached, as a repeated search asks for the same gains."""
     asked = pick.start, taken.names
     if asked not in problem.gains:
         problem.gains[asked] = _gain(problem, pick, taken.rows)

@@ -32,7 +32,7 @@ LINEAR_SIZES = (3e-6, 10e-6, 30e-6, 100e-6, 300e-6)
 SHAPE_SIZES = (0.1, 0.3, 1.0, 3.0)
 """Sizes of a change of a motion's shape that are tried, as multiples of its documented size (`abbe.models.solvers.priors`)."""
 ENOUGH = 3.0
-"""A change is named from this log evidence (after its price) on: with the change, the readings are twenty times as likely."""
+"""Least log evidence (after its price) of a named change: with the change, the readings are twenty times as likely."""
 NEAR = 3.0
 """The runs cannot distinguish a named change from a rival whose evidence is lower by no more than this."""
 MOST = 6
@@ -349,7 +349,7 @@ class ChangeContext:
         return float(np.sqrt(before / count)), float(np.sqrt(after / count)), min(gains)
 
     def _likelier(self, mine: Chosen, change: F1) -> float:
-        """Log likelihood of the runs of ``mine`` with a ``change`` of the coefficients (P,) minus that without."""
+        """How much a ``change`` of the coefficients (P,) increases the log likelihood of the runs of ``mine``."""
         moved = self._scaled(change)[:, 0]
         shifted = mine.rhs - mine.gram @ moved
         plain, with_it = (log_evidence(mine.gram, m, self._open) for m in (mine.rhs, shifted))

@@ -238,7 +238,7 @@ def _judge(
     verdict = _verdict(sum(e.evidence for e in effects), sum(u.evidence for u in unnamed))
     rejected = [(u.label, describe_structure(u, beside=verdict == "named")) for u in unnamed]
     if verdict == "unknown":
-        rejected += [(e.label, f"evidence {e.evidence:.0f}, below that of the structures without a name: not named") for e in effects]
+        rejected += [(e.label, f"evidence {e.evidence:.0f}, less than the structures without a name have: not named") for e in effects]
     for i, j in companion.items():
         share_text = f"evidence {found[i].score / 2.0:.0f}: the effect may be only the deviation of {found[j].pick.label} from its formula"
         rejected.append((found[i].pick.label, share_text))

@@ -180,8 +180,8 @@ def level(
 def fine(residual: F1, lengths: Sequence[int], kinds: Sequence[str], use: F1, leverage: F1) -> dict[str, Colour]:
     """Estimate the noise of each instrument only from differences of neighbours, which contain hardly any effect; arguments as in `level`.
 
-    The noise is that of the instrument's quiet runs (`QUIET`): an effect may be sharp or dense in some runs, but not in all.
-    Instruments without runs of `SHORTEST` readings are left out.
+    The noise is taken from the instrument's quiet runs (`QUIET`): an effect may be sharp or dense in some runs, but not in all. Instruments
+    without runs of `SHORTEST` readings are left out.
     """
     found: dict[str, list[float]] = {}
     start = 0

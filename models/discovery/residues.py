@@ -20,9 +20,10 @@ from abbe.models.discovery.whitened_problem import WhitenedProblem
 RESIDUE_SHARE = 0.001
 """A name with less than this share of the largest evidence cannot be distinguished from a residue of the strongest effect."""
 SCATTER_SHARE, SMOOTH_SHARE, SCATTER = 0.01, 0.003, ("stick_slip", "vibration", "bar_outliers")
-"""Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if their evidence is below
-this share of its evidence. The share is 1 % of an effect with corners or waves (`ROUGH`) and 0.3 % of a smooth one, whose residues look
-less like scatter. A true stick-slip had 1.0 % of a pitch error."""
+"""Stick-slip, vibration and outliers of the bar count as residues of the strongest mean effect, on any axis, if they have less than a share
+of that effect's evidence: 1 % if it has corners or waves (`ROUGH`), 0.3 % if it is smooth, because smooth residues look less like scatter.
+A true stick-slip had 1.0 % of a pitch error's evidence.
+"""
 AXIS_SHARE = 0.0125
 AT_TURNS = ("backlash", "backlash_begun", "backlash_position_dependent", "reversal_spike", "lateral_play", "servo_mismatch")
 """Effects at the reversals of one axis differ only in form: an effect with less than `AXIS_SHARE` of the evidence of another such effect

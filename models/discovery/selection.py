@@ -42,7 +42,7 @@ UNNAMED_LABELS = 40
 FORM_SHARE, FORM_PRICE = 0.6, 6.0
 """Price of a form (`Form`) of a chosen effect: this share of the price of its columns, plus a constant."""
 APART = 0.06
-"""Least relative distance of a second effect's parameter from that of the first effect and from its harmonics."""
+"""Least relative distance between a second effect's parameter and the first effect's parameter and its harmonics."""
 SIDE_BAND = 0.03
 """A second wave nearer to the first than twice `APART`, with less than this share of the first's score, is a side band: the first wave's
 amplitude changes along the axis in another way than its forms allow."""

@@ -119,7 +119,7 @@ class SignalProjection:
         return rows_of(self.left(columns), columns, prior_sd)
 
     def without(self, columns: F2, prior_sd: F1) -> SignalProjection:
-        """Return the projection that removes ``columns`` (n, k) and what this one removes; the new unknowns have independent priors."""
+        """Return the projection that removes ``columns`` (n, k) in addition; the new unknowns have independent priors."""
         rows = self.rows(columns, prior_sd)
         return replace(self, more=np.concatenate([self.more, rows]), y_coordinates=np.concatenate([self.y_coordinates, rows @ self.y]))
 

@@ -20,7 +20,7 @@ UM, PPM = 1e-3, 1e-6
 """One micrometre in mm; one part per million. Columns are mm per UNIT of strength, so that coefficients have the unit shown to people."""
 AXIS_KEYS = ("X", "Y", "Z")
 LATERAL_KEYS = ("EYX", "EZX", "EXY", "EZY", "EXZ", "EYZ")
-"""Straightness components: the axis of the third letter moves, the tool deviates along that of the second."""
+"""Straightness components: the third letter is the moving axis, the second the direction in which the tool deviates."""
 NO_KEY = ("",)
 STEEL_PER_K = 11.5e-6
 """Thermal expansion of steel, 1/K."""
@@ -44,10 +44,10 @@ For stationary curves with a correlation length of 0.3 strokes the median is 2.6
 WITH_CONSTANT = (1.4, 0.7)
 """Ratio of the rms of a smooth curve to its rms without its mean: the median is 1.4, and two of three curves have 1.0 to 2.6."""
 WITH_SLOW = (1.07, 0.06)
-"""Ratio of the final drift of a head or column to that of the exponential that fits its first two or three hours best; with standard
-uncertainty. These parts have several time constants (ISO 230-3): with a second one a quarter to four times as long, of a weight of 15 to 60
-%, the median is 1.08 if a constant is fitted too, else 1.05, and two of three parts have 1.02 to 1.16. In 26 own and practice cases the
-fitted size was 9 % too small on average. A screw is one body: in 16 cases its growth was 2 % too small.
+"""Ratio of the final drift of a head or column to the final value of the exponential that best fits its first two or three hours; with
+standard uncertainty. These parts have several time constants (ISO 230-3). If the second is a quarter to four times as long, with a weight
+of 15 to 60 %, the median ratio is 1.08 with a constant in the fit and 1.05 without, and two of three parts have 1.02 to 1.16. In 26 own and
+practice cases the fitted size was 9 % too small on average. A screw is one body: in 16 cases its growth was 2 % too small.
 """
 
 
@@ -253,7 +253,7 @@ def size(coefficients: F1, values: Values) -> float:
 
 
 def setup_length(parts: int) -> Callable[[F1, Values], float]:
-    """Make a strength function: the rms over set-ups of the length of their ``parts`` coefficients, without set-ups of zeros only."""
+    """Make a strength function: the rms length of the set-ups' vectors of ``parts`` coefficients each; vectors of zeros do not count."""
 
     def strength(coefficients: F1, values: Values) -> float:
         lengths = np.linalg.norm(np.reshape(coefficients, (-1, parts)), axis=1)

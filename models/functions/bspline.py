@@ -17,8 +17,8 @@ from abbe.models.functions.axis_function import frozen_vector, interval, positio
 class BSpline:
     """value(x) = sum of c_i B_i(x) on knots t, between t[degree] and t[m] (m coefficients).
 
-    Outside this interval the end value holds and the slope is zero, as in controllers; at the two ends the slope is the one inside.
-    Where ``degree`` knots coincide the slope may jump; ``derivative`` then returns the slope on the right.
+    Outside this interval the end value holds and the slope is zero, as in controllers; at the two ends the slope is the inner one. Where
+    ``degree`` knots coincide the slope may jump; ``derivative`` then returns the slope on the right.
 
     Parameters
     ----------

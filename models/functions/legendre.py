@@ -27,7 +27,7 @@ def _unit(x_mm: F1, stroke_mm: ArrayLike) -> F1:
 class Legendre:
     """value(x) = sum of c_k P_k(u), u = -1 at the start and +1 at the end of the stroke.
 
-    Outside the stroke the end value holds and the slope is zero, as in controllers; at the two ends the slope is the one inside.
+    Outside the stroke the end value holds and the slope is zero, as in controllers; at the two ends the slope is the inner one.
 
     Parameters
     ----------

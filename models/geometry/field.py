@@ -23,11 +23,11 @@ from abbe.models.machine import Machine, lever_masks, levers_mm
 BLOCK = 4096
 """Points in one block: 18 motions of them are 0.6 MB."""
 SHARED = 65_536
-"""Number of points from which on the cores share the blocks; with fewer points, starting threads costs more than it saves."""
+"""Least number of points for which the cores share the blocks; with fewer points, starting threads costs more than it saves."""
 CORES = 2
 """Number of threads for many points. More would only wait for memory; on a single core the second costs little."""
 LEAST = 512
-"""Number of points from which on it is worth testing whether they form a grid."""
+"""Least number of points for which it is worth testing whether they form a grid."""
 TILE = (8, 4000)
 """Rows and columns of one product, among the fastest of 25 shapes tried. Such a product has 8 x 8 x 4000 multiplications, fewer than the
 2**18 from which on OpenBLAS starts threads of its own.

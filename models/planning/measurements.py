@@ -261,7 +261,7 @@ def _expected_helix(test: HelixTest, tools: Instruments, values: int, start_s: f
 
 @dataclass(frozen=True, slots=True)
 class Opening:
-    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why it is doubtful, else empty."""
+    """Direction in which hemispheres open: ``side`` (1 or -1) of ``axis``; ``warning``: why this direction is doubtful, or empty."""
 
     axis: int
     side: int

@@ -36,8 +36,8 @@ SEARCH_VALUES = 120
 class PlanningProblem:
     """Machine, instruments and priors of a plan, and the unknowns that all mountings share.
 
-    ``root``, shape (size, size): factor of their prior covariance; unknowns (mm, rad) = ``root`` @ independent unknowns of variance 1. The
-    prior is that from which a solution starts (`abbe.models.solvers.priors.size_model`).
+    ``root``, shape (size, size): factor of their prior covariance; unknowns (mm, rad) = ``root`` @ independent unknowns of variance 1. A
+    solution starts from the same prior (`abbe.models.solvers.priors.size_model`).
     """
 
     machine: Machine

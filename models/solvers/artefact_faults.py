@@ -255,7 +255,7 @@ def _radius(joint: JointSolution) -> list[ArtefactFault]:
 
 
 def _twist(joint: JointSolution) -> list[ArtefactFault]:
-    """Rotation growing with r^2 about the artefact's own centre, in its form as a whole."""
+    """Report artefacts with a twist: most of their form is a rotation about their centre that grows with r^2."""
     out, e = [], joint.estimate
     mine = [(r, r.points) for r in joint.data if r.points is not None and r.points.source != "length"]
     for name in dict.fromkeys(p.artefact for _, p in mine):

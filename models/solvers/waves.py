@@ -120,7 +120,7 @@ def peaks(data: Displacements) -> tuple[Peak, ...]:
 
 
 def _hypotheses(axes: tuple[int, ...]) -> list[tuple[tuple[int, ...], float]]:
-    """Axes that have the same periods, with the prior probability."""
+    """Groups of axes that may have the same periods, with their prior probabilities."""
     if len(axes) == 1:
         return [(axes, 1.0)]
     return [(axes, ALL_AXES), *(((a,), (1.0 - ALL_AXES) / len(axes)) for a in axes)]
@@ -219,7 +219,9 @@ def _peaks(axes: tuple[int, ...], frequency: F1, weight: F1, span_mm: float) -> 
 
 
 def _prior(frequencies: F1, span_mm: float) -> F1:
-    """Prior probability of every searched frequency: a usual lead, within the resolution of the positions, or any."""
+    """Prior probability of every searched frequency: usual leads, within the resolution of the positions, share `USUAL`; all share the
+    rest.
+    """
     near = np.abs(frequencies[:, None] - 1.0 / np.array(LEADS_MM)) < 0.5 / span_mm
     usual = (near / np.maximum(near.sum(axis=0), 1)).sum(axis=1) / len(LEADS_MM)
     return np.asarray((1.0 - SMOOTH) * (USUAL * usual + (1.0 - USUAL) / frequencies.size))

@@ -96,4 +96,4 @@ SECOND = replace(
     beside=("cyclic_error",),
     variant_of="cyclic_error",
 )
-"""Error with a second pitch of the same axis, such as that of an encoder in addition to that of the screw."""
+"""Cyclic error of the same axis with a second pitch, such as an encoder's in addition to the screw's."""

@@ -213,7 +213,7 @@ class SphereSurface:
         Raises
         ------
         ExtrapolationRefused
-            A point lies off the measured plane, beyond the outer ones of several, above or below all measured heights, or beyond the
+            A point lies off the measured plane, beyond the outer ones of several planes, above or below all measured heights, or beyond the
             margin.
         ValueError
             The margin is negative.

@@ -161,7 +161,7 @@ class SphereFit:
 
     @property
     def correlation(self) -> F2:
-        """Correlations of centre x, y, z and radius, shape (4, 4); on a hemisphere that of centre z and radius is -0.84."""
+        """Correlations of centre x, y, z and radius, shape (4, 4); on a hemisphere centre z and radius have -0.84."""
         return np.asarray(self.cofactor / np.outer(self.sigma, self.sigma))
 
     def noise_mm(self) -> float:
@@ -240,8 +240,8 @@ def without_absorbed(directions_rad: F2, values_mm: F1) -> F1:
 class ProbeCalibration:
     """Calibration of a probe on a master sphere.
 
-    ``probe_mm`` is the lobing at the touched directions, positive if the reading is too near the centre of the sphere. The four functions
-    `ABSORBED` are missing in it: parts of the true lobing in nx, ny, nz move the fitted centre, a constant part changes the radius.
+    ``probe_mm`` is the lobing at the touched directions, positive if the reading is too near the centre of the sphere. This lobing lacks
+    the four functions `ABSORBED`: parts of the true lobing in nx, ny, nz move the fitted centre, a constant part changes the radius.
 
     Parameters
     ----------

@@ -344,7 +344,7 @@ def _effect(family: Family, field: F2, factor: F1, prior_sd: F1) -> float:
 
 
 def _typical(family: Family, prior_sd: F1) -> F2:
-    """Factor of the prior covariance restricted to these combinations: columns of one standard deviation each, own units."""
+    """Factor of the prior covariance of these combinations: each column is one standard deviation, in the coefficients' own units."""
     scaled = family.vectors / prior_sd[:, None]
     q, _ = scipy.linalg.qr(scaled, mode="economic", check_finite=False)
     return np.asarray(q * prior_sd[:, None])

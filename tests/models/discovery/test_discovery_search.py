@@ -271,7 +271,7 @@ def test_nothing_stands_beside_a_lone_name_or_an_unknown() -> None:
     unknown = discover(campaign(backlash_um=0.8, step_um=6.0), CATALOGUE)
     assert unknown.verdict == "unknown"
     assert unknown.effects == unknown.beside == ()
-    assert "below that of the structures without a name" in dict(unknown.rejected)["backlash:X"]
+    assert "less than the structures without a name have" in dict(unknown.rejected)["backlash:X"]
 
 
 def test_a_role_whose_readings_are_all_flagged_has_no_gap() -> None:
