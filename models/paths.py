@@ -219,7 +219,7 @@ def circle_points(centre_mm: F1, radius_mm: float, plane: Plane, angles_rad: F1)
 
 
 def arc_through(centre_mm: F1, at_mm: F1, along: F1, angles_rad: F1) -> F2:
-    """Return points of the great circle that passes ``at_mm`` in the direction ``along``, at given angles from it (negative: before it).
+    """Return points of the great circle through ``at_mm`` in the direction ``along``, at given angles from ``at_mm`` (negative: before it).
 
     Such an arc leads into a path, or out of a path, without a corner. It stays on the sphere, so that a mounted bar keeps its length.
 

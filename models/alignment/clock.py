@@ -23,7 +23,7 @@ MANY = 100
 """Number of smallest delays from which the exponent of the delay distribution is estimated; with few points, `LOWEST` delays."""
 LEAST_PAIRS = 2 * LOWEST + 2
 EARLY = 3.0
-"""If one arrival lies below the line of all others by more than this many times their 24th smallest delay, its time stamp is wrong."""
+"""If an arrival lies below the line of all others by more than this multiple of the 24th smallest delay, its time stamp is wrong."""
 MOST_EARLY = 3
 STEP_BLOCKS = 40
 LEAST_IN_BLOCK = 10

@@ -117,7 +117,7 @@ def _reversed(some: _Candidates) -> _Candidates:
 
 
 def _chain(some: _Candidates, single_cost: F1, about: tuple[F1, F1, float], *, mirrored: bool = False) -> tuple[F1, I1]:
-    """Return the least cost of a chain that ends at each pair, and the pair before it (-1: none); ``mirrored``: chains run backwards."""
+    """Return the least cost of a chain of pairs that ends at each pair, and the pair before it (-1: none); ``mirrored``: from the end."""
     targets, sides, noise = about
     cost, back = single_cost.copy(), np.full(single_cost.size, -1, dtype=np.intp)
     sign = -1 if mirrored else 1
@@ -357,7 +357,8 @@ def _check_jumps(found: tuple[Standstill, ...], tolerance: float) -> None:
 def _either_side(k: int, pairs: dict[int, int], targets: F1) -> bool:
     """Return whether the standstill of place ``k`` may belong to the previous or next pass over the same target instead.
 
-    It may if only one place, a turning point, lies between the two passes, and neither this place nor the other pass has a standstill.
+    This is possible if a single place, a turning point, lies between both passes, and neither this place nor the other pass has a
+    standstill.
     """
     if k in (0, targets.size - 1):
         return False
@@ -484,7 +485,7 @@ def named(found: Dwells, planned: tuple[PlannedDwell, ...]) -> tuple[str, ...]:
 
 
 def merged(planned: list[PlannedDwell]) -> tuple[PlannedDwell, ...]:
-    """Merge neighbours with the same target into one standstill with the readings and the time of all."""
+    """Merge neighbours with the same target into one standstill with all their readings and their total time."""
     out: list[PlannedDwell] = []
     for one in planned:
         if out and abs(out[-1].target - one.target) < 1e-6:

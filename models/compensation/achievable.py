@@ -212,7 +212,7 @@ def _field(solution: JointSolution) -> tuple[list[int], F2]:
 
 
 def _refit(solution: JointSolution, keep: list[int]) -> F2:
-    """Return the coefficients of the kept terms that best reproduce the deviation by one unit of each coefficient, shape (kept, terms)."""
+    """Return the coefficients of the kept terms that best reproduce the deviation of each single coefficient, shape (kept, terms)."""
     smooth, field = _field(solution)
     n = len(smooth)
     kept = [k for k, i in enumerate(keep) if i in set(smooth)]
@@ -394,7 +394,9 @@ class _ResidualJudge:
         ]
 
     def single_motions(self, counts: tuple[int, int, int], observable: frozenset[str] | None) -> list[Achievable]:
-        """Judge tables of the motions that are observable by themselves, and tables of the fewest motions that are right for this tool."""
+        """Judge tables of the motions that are observable by themselves, and of the fewest motions that reproduce the deviation with this
+        tool.
+        """
         observable_names = individually_observable(self.solution) if observable is None else observable
         out = []
         for kind, motions, any_tool in (

@@ -150,8 +150,8 @@ def _sums(white: F2) -> F2:
 def _tested(white: F2, free: int, noise: _Noise, variance: float, spread: float) -> tuple[float, float] | None:
     """Ratio of rms to expected rms, and p; None where too few degrees of freedom remain.
 
-    The last ``free`` columns of ``white`` are the run's own unknowns. They cost only as many degrees of freedom as the values determine
-    (for a circle about its cup three, not four; for sums over whole turns hardly any). ``variance``: noise variance of a value in units of
+    The last ``free`` columns of ``white`` are the run's own unknowns. They cost only as many degrees of freedom as the values determine:
+    three, not four, for a circle about its cup; hardly any for sums over whole turns. ``variance``: noise variance of a value in units of
     the noise variance of a reading. ``spread``: as in `_Noise`.
     """
     y, known = white[:, 0] / np.sqrt(variance), white[:, 1:] / np.sqrt(variance)
@@ -171,7 +171,7 @@ FOLDS = 5
 
 
 def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[str, Floor]) -> Gap | None:
-    """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None if a finding has no mean effects.
+    """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None without mean effects.
 
     Unknowns of the simulation and coefficients of the effects are fitted anew without the block. Selection and non-linear parameters
     of the effects come from all readings. So this proves less than a holdout run, and more than the residuals of the fit.

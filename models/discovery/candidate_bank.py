@@ -25,7 +25,7 @@ MOST_CACHED = 16
 """Number of picks whose columns are cached; a search often returns to recent picks."""
 Short = NDArray[np.float32]
 PART = 20
-"""Candidates whitened together; whitening makes several copies of its input."""
+"""Number of candidates whitened at once; whitening makes several copies of its input."""
 
 
 @dataclass(frozen=True)

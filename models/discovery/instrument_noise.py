@@ -134,7 +134,7 @@ def _as_read(whitened: F1, colour: Colour) -> F1:
 
 
 def _likelihood(read: F1, colour: Colour) -> float:
-    """Log likelihood of the readings of a run with noise of this colour and its best level; large values count as `LOUDEST`."""
+    """Log likelihood of the readings of a run with noise of this colour and its best level; outliers count as `LOUDEST` deviations."""
     white = unscaled(read[:, None], [read.size], [""], {"": colour})[:, 0]
     white = np.minimum(np.abs(white), LOUDEST * max(robust_sd(white), 1e-12))
     v = colour.filter()[2]

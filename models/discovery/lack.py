@@ -131,8 +131,7 @@ def lack_of_fit(
 
 
 def unexplained(problem: WhitenedProblem, picks: Sequence[Pick], floor: Mapping[str, Floor], calm: F1) -> float:
-    """Return by how much residuals of simulation and ``picks`` exceed the noise ``floor``, in nats; 0 if they do not exceed it `TIMES`
-    times.
+    """Return by how much residuals of simulation and ``picks`` exceed the noise ``floor``, in nats; 0 if by less than a factor of `TIMES`.
 
     ``calm``: weight of each reading, shape (n,), 0 for readings with scatter from a known effect.
     """

@@ -18,7 +18,7 @@ from abbe.models.arrays import F1, F2
 P_LIMIT = 0.005
 """A drift is claimed only below this p-value."""
 SHARE_LIMIT = 0.5
-"""Least share of the repeat variance of a claimed drift; the removal of a smaller drift improves repeatability by less than 30 %."""
+"""A claimed drift explains at least this share of the repeat variance; removing less improves repeatability by less than 30 %."""
 TAUS = (0.15, 0.3, 0.6, 1.2)
 """Time constants tried, as fractions of the test's duration; a longer one is nearly a straight line."""
 TRIALS = 2000

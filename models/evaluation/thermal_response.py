@@ -23,7 +23,7 @@ from abbe.models.arrays import F1, F2, F3
 from abbe.models.probability import t_above
 
 REFERENCE_C = 20.0
-"""ISO 1."""
+"""Reference temperature, ISO 1."""
 BLOCK_S = 300.0
 """Readings are averaged over this time before the fit; heat deforms a machine more slowly."""
 TIME_CONSTANTS_S = tuple(60.0 * m for m in (3, 5, 8, 12, 16, 20, 25, 30, 40, 60, 90, 120, 180))

@@ -208,7 +208,7 @@ class MapAgainstPrior:
 
     @property
     def read(self) -> bool:
-        """Whether the map exceeds the priors' rms by at most `MOST_READ` times what a run measured, or is known to `WELL_KNOWN`."""
+        """Whether the map is at most `MOST_READ` times a run's rms above the priors' rms, or is known to the share `WELL_KNOWN`."""
         return self.predicted_mm <= self.prior_mm + MOST_READ * self.measured_mm or self.u_mm <= WELL_KNOWN * self.predicted_mm
 
 

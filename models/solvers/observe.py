@@ -58,8 +58,8 @@ BAR_DIGITS = 2
 class SetupUnknowns:
     """Names and prior standard deviations of a campaign's set-up unknowns.
 
-    ``start_s``: first reading of each set-up but the laser's. ``details``: what each laser run reads per unit of every set-up unknown
-    because of details of the machine (`abbe.models.solvers.engine`), by label, shape (n, set-up).
+    ``start_s``: time of the first reading of each set-up, except the laser's. ``details``: what each laser run reads per unit of every
+    set-up unknown because of details of the machine (`abbe.models.solvers.engine`), by label, shape (n, set-up).
     """
 
     names: tuple[str, ...]
@@ -163,7 +163,7 @@ def _bent(run: RunData) -> bool:
 
 
 def _off_path(run: RunData) -> float:
-    """Sine of the angle between a straight path and the beam; 0 for another path or one that stands still."""
+    """Sine of the angle between a straight path and the beam; 0 for a path that is not straight or stands still."""
     assert run.beam is not None
     line = straight_line_of(run.axes_mm)
     return 0.0 if line is None or not line[1].any() else float(np.linalg.norm(np.cross(line[1], run.beam)))
@@ -447,7 +447,7 @@ class _Laser:
         return self.motions[:, :, 3:].sum(axis=1) if self.run.mirror_turns else None
 
     def _turned(self, vector: F1) -> F2:
-        """Directions of a vector of the mirror, shape (n, 3)."""
+        """Directions of a vector that is fixed to the mirror, shape (n, 3)."""
         vectors = np.broadcast_to(vector, self.run.axes_mm.shape)
         return vectors if self._rotation is None else vectors + turn_vector(self._rotation, vectors)
 

@@ -24,9 +24,7 @@ from abbe.models.solvers.priors import Priors, term_prior_sd
 
 SIGMA_GRID_MM = np.geomspace(1e-6, 1.0, 49)
 OUTLIER_SIGMA, OUTLIER_SHARE = 3.5, 0.2
-"""`OUTLIER_SIGMA`: standard deviations from its run's other readings at which a reading is left out. `OUTLIER_SHARE`: largest share left
-out.
-"""
+"""Readings `OUTLIER_SIGMA` standard deviations off their prediction by the run's others are left out: at most `OUTLIER_SHARE` of a run."""
 
 
 @dataclass(frozen=True)

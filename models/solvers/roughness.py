@@ -161,7 +161,7 @@ class _Search:
         return whole.real, whole.imag
 
     def _scan(self, rest: F1, axis: int, component: int) -> tuple[float, float, bool]:
-        """Largest gain in chi squared, its frequency, and whether no other frequency comes near."""
+        """Largest gain in chi squared, its frequency, and whether no other frequency gains nearly as much."""
         length = float(self.solution.machine.length_mm[axis])
         frequency = np.arange(1.0 / LONGEST_MM, 1.0 / SHORTEST_MM, 0.4 / length)
         cosine, sine = self._waves(axis, component, frequency)

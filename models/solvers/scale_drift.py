@@ -60,7 +60,7 @@ def scale_drifts(problem: CampaignProblem, fit: CampaignFit) -> tuple[ScaleDrift
 
 
 def drift_factor(problem: CampaignProblem, drifts: tuple[ScaleDrift, ...]) -> F2:
-    """Factor (p, k) of the scales' covariance: at another time a scale may differ by up to as much as it changed (GUM 4.3.7)."""
+    """Factor (p, k) of the scales' covariance: at another time a scale may differ by up to its whole change (GUM 4.3.7)."""
     factor = np.zeros((len(problem.names), len(drifts)))
     for k, one in enumerate(drifts):
         factor[problem.names.index(SCALES[one.axis]), k] = one.change * problem.machine.length_mm[one.axis] / 2.0 / np.sqrt(3.0)

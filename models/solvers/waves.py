@@ -82,7 +82,7 @@ class Displacements:
 
     @property
     def span_mm(self) -> float:
-        """Longest way along an axis."""
+        """Longest extent of the positions along an axis."""
         return float(max(np.ptp(self.at_mm[self.axis == a]) for a in set(self.axis.tolist())))
 
     def waves(self, axes: tuple[int, ...], frequency: F1) -> NDArray[np.float64]:
@@ -219,9 +219,7 @@ def _peaks(axes: tuple[int, ...], frequency: F1, weight: F1, span_mm: float) -> 
 
 
 def _prior(frequencies: F1, span_mm: float) -> F1:
-    """Prior probability of every searched frequency: usual leads, within the resolution of the positions, share `USUAL`; all share the
-    rest.
-    """
+    """Prior probability of every searched frequency: usual leads get `USUAL` (within the positions' resolution), all together the rest."""
     near = np.abs(frequencies[:, None] - 1.0 / np.array(LEADS_MM)) < 0.5 / span_mm
     usual = (near / np.maximum(near.sum(axis=0), 1)).sum(axis=1) / len(LEADS_MM)
     return np.asarray((1.0 - SMOOTH) * (USUAL * usual + (1.0 - USUAL) / frequencies.size))

@@ -20,7 +20,7 @@ from abbe.models.probability import chi2_above
 HERTZ = (2.0, 75.0)
 PADDING = 4
 LOW_CYCLES, PER_TURN = 6.0, 2.0
-"""Aliased frequencies below this many cycles per run plus this many per turn of the bar count as residues of the mean model."""
+"""Aliased frequencies below `LOW_CYCLES` cycles per run plus `PER_TURN` per turn of the bar count as residues of the mean model."""
 LOBES_PER_TURN = 12.0
 """Up to this many cycles per turn of the bar, a line may come from the form of balls or machine; runs in this range do not prove a line."""
 REGULAR = 0.02

@@ -29,7 +29,7 @@ def wave(at: Places, key: str, values: Values) -> F3:
 
 
 def _second(at: Places, key: str, values: Values) -> F3:
-    """Return the second harmonic: offsets of an encoder's signals make a wave of its period; unequal gains and phase errors, of half its
+    """Return the second harmonic: offsets of an encoder's signals make a wave of one period, unequal gains or phases a wave of half a
     period.
 
     Source: Heydemann, Appl. Opt. 20 (1981) 3382.

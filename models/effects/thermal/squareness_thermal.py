@@ -8,7 +8,7 @@ from abbe.models.effects.effect import Effect, Form, Parameter, Values
 from abbe.models.effects.path import Path, Places
 
 CARRIED = {"XY": (1, 0, -1.0), "ZX": (2, 0, 1.0), "YZ": (2, 1, -1.0)}
-"""Axis that travels, direction that deviates, sign of the right-hand rotation C0Y, B0Z, A0Z (docs/explanation/conventions.md)."""
+"""By squareness: axis that travels, direction that deviates, sign of the right-handed rotation (docs/explanation/conventions.md)."""
 
 
 def _travel(path: Path, at: Places, key: str) -> tuple[int, F1]:

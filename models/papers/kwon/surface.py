@@ -109,7 +109,7 @@ def anova(values: F1, fitted: F1, rank: int) -> Anova:
 
 
 def anova_from_sums(ss_reg: float, ss_res: float, df_reg: int, df_res: int, ss_tot: float | None = None) -> Anova:
-    """Return the analysis of variance of given sums, e.g. printed ones; the default of the total is the sum of the others.
+    """Return the analysis of variance of given sums, e.g. printed ones; the total defaults to the sum of the other two.
 
     Raises
     ------

@@ -21,7 +21,7 @@ CHAIN = "w-b-X-Y-Z-t"
 """FXYZ: the workpiece on the bed (F), then X, Y, Z towards the tool."""
 
 ACUTE_FROM_OBTUSE = -1.0
-"""Factor from the squareness of (9) and (11) to that of (12) and (13)."""
+"""Factor that converts the squareness of (9) and (11) to the squareness of (12) and (13)."""
 _ANY = np.array([[0.0, 1.0]] * 3)
 """Any strokes; the deviation does not depend on them."""
 
@@ -289,7 +289,7 @@ def step_readings_mm(path_mm: F2, deviation_mm: F2, beam: F1, mirror: F1) -> F1:
 
 
 def tilt_bias_eq7(inc_mm: F1, tilt: dict[str, F1]) -> F2:
-    """Return the bias by tilted mirrors of each interval of (7), shape (3 directions i, 3 axes a), mm per step.
+    """Return the bias that tilted mirrors cause in each interval of (7), shape (3 directions i, 3 axes a), mm per step.
 
     The bias is linear in position: false scale and squareness errors of the size of the tilt.
 

@@ -339,7 +339,7 @@ class CureTrial:
     observed: F2
 
     def shows(self, combinations: F2) -> int:
-        """Number of the hidden combinations that the addition makes visible, given as columns (k, m) of orthonormal coordinates."""
+        """Number of combinations that the addition shows, of hidden ones given as columns (k, m) of orthonormal coordinates."""
         return count_observed(self.observed @ combinations)
 
 
@@ -360,7 +360,7 @@ def trials(campaign: CampaignLayout, observed: ObservedInformation) -> list[Cure
 
 
 def best_sequence(found: list[CureTrial], hidden: int) -> list[tuple[Addition, int]]:
-    """Choose additions one by one, each showing most of the combinations still hidden; return them with the number shown after each."""
+    """Choose one by one the addition that shows most combinations still hidden; return the additions with the number shown after each."""
     out: list[tuple[Addition, int]] = []
     stack, left, shown = np.zeros((0, hidden)), list(found), 0
     while left and shown < hidden:

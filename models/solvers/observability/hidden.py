@@ -18,8 +18,9 @@ from abbe.models.solvers.observability.rank import ObservedInformation
 from abbe.models.solvers.observability.volume import frame_free_design, inner_box
 
 LARGEST_SET, LARGEST_SET_OF_LOW, LOW = 3, 4, 2
-"""Largest sets of motions that are searched for hidden combinations: with all orders, and with orders up to LOW, which are tried first (the
-slope of an angle times the travel of its own axis is of order 2). All other hidden combinations are reported as mixtures."""
+"""Size of the largest sets of motions that are searched for hidden combinations: with all orders, and with orders up to `LOW`, which are
+tried first (the slope of an angle times the travel of its own axis is of order 2). All other hidden combinations are reported as mixtures.
+"""
 INSIDE = 1e-9
 """A set of motions contains a hidden combination if its block of the null space's projector has an eigenvalue within this of 1."""
 ENTRY = 1e-6
@@ -166,7 +167,7 @@ def _merged(terms: tuple[Term, ...], found: list[tuple[tuple[str, ...], F2]], fa
 
 
 def _holding(shadow: F2, rows: dict[str, list[int]], size: int) -> list[tuple[tuple[str, ...], int]]:
-    """Sets of ``size`` motions that contain hidden combinations, and how many: the eigenvalues 1 of a set's block of the projector."""
+    """Sets of ``size`` motions, with the number of hidden combinations that each contains: eigenvalues 1 of its block of the projector."""
     sets = list(combinations(rows, size))
     if not sets:
         return []

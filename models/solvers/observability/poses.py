@@ -20,8 +20,9 @@ from abbe.models.solvers.observations import RunData
 
 DEGREE = 4
 HIDDEN, TOLERANCE = 0.02, 1e-3
-"""`HIDDEN`: a field is hidden if the share of it that form and poses cannot explain is smaller. `TOLERANCE`: least singular value that
-counts, as a share of the largest: poses that differ by only a millimetre give no information about micrometres."""
+"""`HIDDEN`: a field is hidden if form and poses leave less than this share of it unexplained. `TOLERANCE`: least singular value that
+counts, as a share of the largest: poses that differ by only a millimetre give no information about micrometres.
+"""
 FLAT = 1e-3
 SHIFT = 0.37
 """Proposed shift as a share of a pitch; not a simple fraction, so that it is no simple fraction of the screw's lead either."""
@@ -71,7 +72,7 @@ def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
 
 
 def are_tilted(runs: tuple[RunData, ...]) -> bool:
-    """Whether a probed artefact lay tilted in some pose: its plane is none of the machine's."""
+    """Whether a probed artefact lay tilted in some pose, that is, in no plane of two machine axes."""
     return any(np.abs(r.points.matrix[:, 2]).max() < 1.0 - FLAT for r in runs if r.points is not None and r.points.source == "probe")
 
 

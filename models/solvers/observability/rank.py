@@ -73,7 +73,7 @@ def as_meant(run: RunData) -> RunData:
 
 
 def _on_the_sphere(run: RunData) -> F2:
-    """Positions of a ball-bar run moved to the nominal distance from the cup, if all are within the bar's range of it."""
+    """Positions of a ball-bar run moved to the nominal distance from the cup, if all lie within the bar's measuring range."""
     assert run.centre_mm is not None
     assert run.radius_mm is not None
     bar = _resting(run.axes_mm) - run.centre_mm
