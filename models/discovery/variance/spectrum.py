@@ -32,7 +32,7 @@ REFINED, WORTH = 2, 7.0
 LEAST_READINGS = 12.0
 """A gate with fewer effective readings is not tried."""
 ALIKE = 1.94
-"""Divisor for squared second differences, which are correlated from reading to reading for white noise."""
+"""Divisor for gains from squared second differences, which are correlated from reading to reading even for white noise."""
 FEW = 3
 """The gain of this many largest readings is left out, because a reversal that the mean model misses by one reading is not roughness."""
 WINDOWS_S = (1.0, 2.0, 4.0)
