@@ -21,7 +21,7 @@ BUILTIN = Path(__file__).with_name("described") / "files"
 Kind = Literal["displacement", "position", "temperature"]
 Type = Literal["u16", "i16", "u32", "i32", "u64", "i64", "f32", "f64"]
 SIZE: dict[Type, int] = {"u16": 1, "i16": 1, "u32": 2, "i32": 2, "f32": 2, "u64": 4, "i64": 4, "f64": 4}
-"""Registers of a value."""
+"""Number of registers of a value, by its type."""
 Order = Literal["ABCD", "CDAB", "BADC", "DCBA"]
 Unit = Literal["nm", "um", "mm", "in", "degC", "degF", "Pa", "hPa", "%", "permille", "us", "ms", "s", "1"]
 QUANTITIES: dict[str, tuple[Unit, ...]] = {
@@ -79,7 +79,7 @@ class DeviceValue(DeviceTable):
 
 
 class IdentityRegisters(DeviceTable):
-    """Registers whose content identifies the device. Two or more registers with asymmetric content also prove the byte order."""
+    """Registers whose content identifies the device; two or more prove the byte order, if no other order gives the same content."""
 
     address: Register
     type: Type = "u16"

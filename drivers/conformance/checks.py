@@ -178,7 +178,7 @@ async def _moved(probe: DeviceUnderTest, file: DeviceFile | None, name: str, mov
 
 
 async def _mean(probe: DeviceUnderTest, name: str) -> float:
-    """Mean of some readings that began after now and a short time to settle."""
+    """Return the mean of some readings, taken after a short time to settle."""
     await asyncio.sleep(SETTLED_S)
     number, values = (await probe.sample(None)).number, []
     for _ in range(AVERAGED):

@@ -152,7 +152,7 @@ OWN_TIMEOUT_S = 1.0
 AT_REST_MM = 0.002
 _METER, _CONTROL = ("motion displacement",), ("motion x", "motion y", "motion z")
 MOTIONS = {"displacement": _METER, "laser": _METER, "ballbar": ("motion radius",), "position": _CONTROL, "cnc": _CONTROL}
-"""Checks of a known motion that must pass before a measurement may use readings of a kind."""
+"""By kind or role of a device: the checks of a known motion that must pass before a measurement may use its readings."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -48,7 +48,7 @@ class ModbusSource:
         self._epoch = 0
 
     async def identify(self) -> DeviceInfo:
-        """Compare the identity registers, and accept the device's present start as the current one.
+        """Compare the identity registers, and remember the present content of the boot registers, which a restart changes.
 
         Raises
         ------

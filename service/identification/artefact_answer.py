@@ -18,7 +18,7 @@ COVERAGE = 2.0
 ONE_PLANE_MM = 5.0
 """Points lie in one plane if consecutive heights, in order of size, differ by no more than this."""
 WHOLE_TO, NOTHING_FROM = 0.35, 1.0
-"""Ratios of mean squared uncertainty to mean squared deviation: up to the first a map is offered whole, from the second not at all."""
+"""Ratios of mean squared uncertainty to mean squared deviation: up to the first the whole map is offered, from the second on none."""
 TILTED = "The artefact lay tilted: Abbe does not list the errors that its poses hide, but U of the deviation includes them."
 MOTION = "best-fit rigid motion{plane}{scale} over these points removed"
 NO_LENGTH = "; no length is calibrated: the scale is not observable"

@@ -24,7 +24,7 @@ R = TypeVar("R")
 
 
 class Executor(Protocol):
-    """Runs jobs. The function must belong to a module, and jobs and results must be plain values, because other processes receive them."""
+    """Runs jobs. Other processes receive them: ``work`` must be a function of a module, jobs and results must be plain values."""
 
     def map(self, work: Callable[[J], R], jobs: Iterable[J]) -> Iterator[R]:
         """Return the results in the order of the jobs. The error of a job is raised in place of its result."""

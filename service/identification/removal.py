@@ -1,4 +1,4 @@
-"""Subtract from a campaign's readings what a new table must not correct: side effects of the table in force, and effects of other remedies.
+"""Subtract from a campaign's readings what a new table must not correct: side effects of the table in force, effects with another remedy.
 
 Everything that a table in force does beyond smooth corrections is subtracted. The table is known exactly, from the controller or the
 database. Lost motion, interpolation and rounding change the moves that the table commands: these effects are subtracted. The
@@ -235,8 +235,8 @@ def remove_effects(
 ) -> RemovedEffects:
     """Subtract effects that tables cannot correct from a campaign's readings.
 
-    Of ``table``, which was active during the measurement, the effect beyond smooth corrections is subtracted. Of the model book of the
-    machine, the effects are subtracted that apply to this campaign and have another remedy than a table; without a ``store`` none are.
+    These are: what ``table``, which was active during the measurement, does beyond smooth corrections; and the effects in the machine's
+    model book that apply to this campaign and have another remedy than a table (none without a ``store``).
 
     Raises
     ------

@@ -267,7 +267,7 @@ def check_instruments(joint: JointSolution, data: tuple[RunData, ...]) -> list[C
 
 
 def changing_scales(joint: JointSolution) -> list[CampaignIssue]:
-    """Return a flag for each scale that changed during the campaign, as of a ball screw that warms up."""
+    """Return a flag for each scale that changed during the campaign, for example because a ball screw warms up."""
     first = min(joint.data, key=lambda run: run.t_s[0]).label
     issues = []
     for one in joint.scale_drifts:

@@ -219,7 +219,7 @@ def _scale_free(found: Assessment) -> Assessment | None:
 
 
 def scale_text(found: Assessment) -> str:
-    """Return the uncertainty without the scales, as the end of a clause; empty unless scales are its largest part."""
+    """Return text about the uncertainty without the scales, to end a sentence with; empty unless scales are its largest part."""
     free = found.scale_free
     if free is None or free.left_out is None:
         return ""

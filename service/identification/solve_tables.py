@@ -106,7 +106,7 @@ def deviation_text(found: Assessment, points_mm: F2) -> str:
 
 
 def monte_carlo(found: Assessment, progress: ProgressText) -> MonteCarloCheck:
-    """Check the 95 % intervals at the point with the largest U by Monte Carlo trials (GUM-S1); stated limits are rectangular."""
+    """Check the 95 % intervals at the point with the largest U by Monte Carlo trials (GUM-S1); stated limits are drawn as rectangular."""
     p, at = found.prediction, worst_point(found.prediction)
     trials = campaign_trials(found.sources, p.points_mm[at : at + 1], frame=volume_frame(found.joint.machine), distributions=LIMITS)
     draw, done = trials.linear(), 0

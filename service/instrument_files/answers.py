@@ -95,7 +95,7 @@ def open_questions(content: Content, answers: Answers) -> list[Question]:
 
 
 def settled(content: Content, answers: Answers) -> AxisReadings | None:
-    """The test of a file with every answer applied; None without a test.
+    """The test of a file with every answer applied; None if the file has no test.
 
     Raises
     ------
@@ -156,7 +156,7 @@ def unknown_of(test: AxisReadings) -> list[str]:
     if test.feed_mm_min is None:
         out.append("feed")
     if test.t_s is None:
-        out.append("times of the readings: t_s counts them in their order")
+        out.append("times of the readings: t_s is the number of each reading in order")
     out.append("positions of the other axes: 0 is written")
     return out
 

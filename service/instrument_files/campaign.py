@@ -74,7 +74,7 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
 
 
 def checked_campaign(name: str, machine: Doc, runs: Sequence[Run], further: Doc) -> FolderContent:
-    """Make a campaign of runs that come from files, and check it like a folder; ``further``: the other keys of its document.
+    """Make a campaign of runs that come from files, and check it like a campaign folder; ``further``: the other keys of its document.
 
     Raises
     ------

@@ -54,7 +54,7 @@ class Direction(ColumnFilePart):
 
 
 def toml_of(columns: ColumnFile) -> str:
-    """The column file as TOML, without what is default."""
+    """The column file as TOML, without default values."""
     doc = columns.model_dump(exclude_none=True, exclude_defaults=True)
     plain = {key: value for key, value in doc.items() if not isinstance(value, dict)}
     lines = ['format = "abbe-columns/1"', *(f"{key} = {json.dumps(value)}" for key, value in plain.items())]
@@ -68,9 +68,10 @@ def toml_of(columns: ColumnFile) -> str:
 class ColumnFile(ColumnFilePart):
     """Meaning of the columns of a table (``abbe-columns/1``, TOML).
 
-    ``measured`` (positions) or ``deviation``; without ``direction`` the order of the targets decides. Without ``target`` the axis stood at
-    ``at_mm``, and ``time``, or ``every_s`` from row to row, says when it was read. ``temperatures``: further sensors by name. ``heading``:
-    row of the headings, 0 for none; rows above it are not read. ``decimal``: the decimal sign of a text file.
+    The readings are in ``measured`` (positions) or ``deviation``. Without ``direction`` the order of the targets decides the direction.
+    Without ``target`` the axis stood at ``at_mm``; then ``time``, or ``every_s`` from row to row, says when it was read.
+    ``temperatures``: further sensors by name. ``heading``: row of the headings, 0 for none; rows above it are not read. ``decimal``: the
+    decimal sign of a text file.
     """
 
     format: Literal["abbe-columns/1"] = "abbe-columns/1"

@@ -98,7 +98,7 @@ def lines_of(found: CyclicError) -> list[str]:
 
 
 def answer_doc(found: CyclicError) -> dict[str, Any]:
-    """Return the result as JSON: nm and rad, standard uncertainties; the error is amplitude sin(order phase + start)."""
+    """Return the result as JSON: nm and rad, standard uncertainties; the error is amplitude * sin(order * phase + start)."""
     doc: dict[str, Any] = {
         "what": "interferometer_cyclic_error",
         "fringe_nm": found.fringe / NM,

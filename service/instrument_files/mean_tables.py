@@ -1,4 +1,7 @@
-"""Tables of means: API .pos and the compensation report .REN. Neither states the sign of its values; one public reader knows each."""
+"""Tables of means: API .pos and the compensation report .REN.
+
+Each format is known from one public reader. Neither states the sign of its values.
+"""
 
 from __future__ import annotations
 
@@ -27,7 +30,7 @@ Table = tuple[list[float], list[float], list[str], list[int]]
 
 
 def read_pos(name: str, data: bytes) -> Content:
-    """Read a .pos of an API laser: tables of mean deviations, mm. Forward and reverse tables make a test of one approach from each side.
+    """Read a .pos of an API laser: tables of mean deviations, mm. A forward and a reverse table become one test, approached from both sides.
 
     Raises
     ------

@@ -1,7 +1,7 @@
 """Lists of an artefact's points as a campaign: CSV files with named columns, one pose each, and reports of plug plates from a CMM.
 
-A CSV file has lines ``# key: value`` (`HEAD`, docs/reference/instrument-files.md) above its header. Its columns are those of a run of an
-artefact and ``nominal_x_mm`` .. of the features; without columns ``deviation_..`` these are computed from the positions that were found.
+A CSV file has lines ``# key: value`` (`HEAD`, docs/reference/instrument-files.md) above its header. Its columns are the columns of an
+artefact's run, and ``nominal_x_mm`` .. of the features; missing columns ``deviation_..`` are computed from the positions that were found.
 """
 
 from __future__ import annotations
@@ -207,7 +207,7 @@ def _run(one: PointList, campaign: str, label: str, machine: Doc, columns: Colum
 
 @dataclass(frozen=True)
 class KnownArtefact:
-    """Facts of one artefact in the files; ``features``: by name."""
+    """What the files state about one artefact; ``features``: by name."""
 
     kind: str
     features: Mapping[str, Doc]

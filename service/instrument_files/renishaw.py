@@ -301,4 +301,4 @@ _TAKEN: Mapping[str, tuple[float, float, float]] = {
     "air press": (*_AIR_HPA, HPA),
     **{f"mat temp {k}": _MATERIAL for k in (1, 2, 3)},
 }
-"""Names that become columns: least and largest value, and the unit in °C or Pa."""
+"""Quantities that become columns, by name in the file: least and largest value, and the unit in °C or Pa."""

@@ -26,7 +26,7 @@ from abbe.service.storage.store import Store
 
 State = Literal["good", "look", "bad"]
 FREE_BYTES, FREE_LOW_BYTES = 5 * 10**9, 10**9
-"""Free space of the database's disk, bytes: below the first a warning, below the second an error (a campaign has about 0.1 GB)."""
+"""Free space of the database's disk, bytes: less than the first is worth a look, less than the second is bad (a campaign takes 0.1 GB)."""
 SYNCHRONISED = Path("/run/systemd/timesync/synchronized"), Path("/run/chrony"), Path("/run/ntpd.pid")
 """A file or folder of a program that sets the clock."""
 SOON = timedelta(days=30)
@@ -86,7 +86,7 @@ def _certificates(loaded: LoadedMachine, now: datetime) -> Iterator[Examined]:
 
 
 def _place(loaded: LoadedMachine) -> Iterator[Examined]:
-    """Examine the folder of a SQLite file: its rights and its room."""
+    """Examine the folder of a SQLite file: its rights and its free space."""
     parsed = parse_database(loaded.database_url)
     if parsed.drivername != "sqlite" or not parsed.database or parsed.database == ":memory:":
         return

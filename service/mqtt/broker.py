@@ -15,8 +15,11 @@ from abbe.service.errors import ConfigError
 
 @dataclass(frozen=True, slots=True)
 class TlsFiles:
-    """PEM files of an encrypted connection: of the authority that signed the broker's certificate (empty: those that this computer trusts),
-    and the client's certificate with its key, if the broker requires one."""
+    """PEM files of an encrypted connection.
+
+    ``ca``: certificate of the authority that signed the broker's certificate; empty: the authorities that this computer trusts.
+    ``certificate``, ``key``: the client's, if the broker requires them.
+    """
 
     ca: str = ""
     certificate: str = ""
@@ -126,17 +129,17 @@ class Topics:
 
     @property
     def state(self) -> str:
-        """Retained: online, measuring or offline. The broker itself publishes offline when the service vanishes (last will)."""
+        """Topic of the retained state: online, measuring or offline. If the service vanishes, the broker publishes offline (last will)."""
         return f"{self.prefix}/{level(self.machine)}/state"
 
     @property
     def verification(self) -> str:
-        """One message for every check."""
+        """Topic with one message for every check."""
         return f"{self.prefix}/{level(self.machine)}/verification"
 
     @property
     def alarm(self) -> str:
-        """One message for each event that a person should look at."""
+        """Topic with one message for each event that a person should look at."""
         return f"{self.prefix}/{level(self.machine)}/alarm"
 
 

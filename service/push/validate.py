@@ -38,7 +38,7 @@ class PushLimits:
     second_mm : float
         Largest second difference.
     gain, k : float
-        Smallest predicted improvement of the rms: relative; and as a multiple of the model's standard uncertainty.
+        Smallest predicted improvement of the rms: as a share of the rms, and as a multiple of the model's standard uncertainty.
     beyond : float
         Largest part of a stroke, 0 to 1, that a table corrects beyond the positions of the runs, at either end.
     share : float
@@ -142,7 +142,7 @@ class CandidateContext:
     machine, machine_mark : str
         Name; mark that changes when older measurements no longer hold (the boot ids of the controller).
     map_version, lsb_nm, bank_registers : int
-        Of the controller.
+        Register map, unit of a table's values and size of a bank, as the controller states them.
     travel_mm : dict
         Axis -> (lowest, highest) position.
     grid_mm : dict
@@ -150,7 +150,7 @@ class CandidateContext:
     active_crc, active : int, dict
         Table in force: its CRC; (moved, corrected) -> corrections on the candidate's grid, empty for no correction.
     month_ago : dict
-        The same for the table of 30 days ago.
+        As ``active``, for the table of 30 days ago.
     now_s : float
         Seconds UTC.
     attended : bool

@@ -38,7 +38,7 @@ class Trends:
 def checks(
     reader: Reader, machine: str | None, verdict: str | None, cursor: int | None, limit: int
 ) -> tuple[list[Verification], int | None]:
-    """Return the checks of all machines, newest first, without those stored in another form."""
+    """Return the checks of all machines, newest first, without checks that are stored in another form."""
     rows, after = reader.page("verifications", {"machine": machine, "verdict": verdict}, cursor, limit)
     return [one for row in rows if (one := _check(row)) is not None], after
 

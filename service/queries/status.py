@@ -205,7 +205,7 @@ def alarms(store: Store, machine: str, *, every: bool = False) -> list[AlarmSumm
 
 
 def summaries(found: Sequence[Alarm], *, every: bool = False) -> list[AlarmSummary]:
-    """Convert alarms, given oldest first, for people: newest first, only the open ones or all."""
+    """Convert alarms (oldest first) to summaries for people (newest first): the open alarms, or every alarm."""
     return [_alarm(one) for one in reversed(found) if every or is_open(one)]
 
 

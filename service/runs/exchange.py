@@ -300,7 +300,7 @@ def _write_json(path: Path, document: Doc) -> None:
 
 
 def _write_csv(path: Path, columns: Doc) -> None:
-    """Columns of a run with all digits; a sealed column is left out."""
+    """Columns of a run with all digits; a column of withheld readings is left out."""
     known = {name: values for name, values in columns.items() if values is not None}
     rows = [",".join(known), *(",".join(map(repr, row)) for row in zip(*known.values(), strict=True))]
     _write_bytes(path, "\n".join([*rows, ""]).encode())

@@ -36,11 +36,11 @@ class PointsFile:
     axes_mm : array, shape (n, 3)
         Commanded positions.
     direction : array, shape (n, 3), or None
-        Sign of each axis' last move; 0 for an axis without a column; None without any such column.
+        Sign of each axis' last move; 0 for an axis without a column; None if no axis has one.
     directed : tuple of int
         Axes that have a direction column.
     tool_mm : array, shape (n, 3), or None
-        Tool at each point; None without such columns.
+        Tool at each point; None if the file has no such columns.
     lines : array of int, shape (n,)
         Line of each point in the file.
     unused : list of str

@@ -106,7 +106,7 @@ def _fit(pairs: Any, grid_s: float) -> ClockFit:
 def _compared(fits: tuple[ClockFit, ClockFit], end: RunEnd, edges: Edges) -> Doc:
     """Return the times of the edges by the arrivals minus those by the controller, ms of controller time.
 
-    Positive: by the arrivals, the edge came after the controller's start (or end) of the path, which the sync line showed too late.
+    Positive: by the arrivals, the path began (or ended) before the sync line shows it.
     """
     doc: Doc = {"box_drift_ppm": fits[0].drift_ppm, "controller_drift_ppm": fits[1].drift_ppm}
     path_us = end.path_us
@@ -213,7 +213,7 @@ def bar_columns(
     rate : float
         Seconds of the controller per second of the box (`abbe.service.runs.sample_columns`).
     full : bool
-        Whether to give all columns; otherwise positions are NaN and there are no further columns, which take half the time.
+        Whether to give all columns. Otherwise positions are NaN and further columns are missing, which halves the time.
 
     Returns
     -------

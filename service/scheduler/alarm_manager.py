@@ -166,7 +166,7 @@ class AlarmManager(RetryingStore):
         await self._record_pushed(found.alarm, found.proposal, after, JobOutcome(done.word, text))
 
     def _of_proposal(self, proposal: int, after: int) -> JobOutcome | None:
-        """Return the outcome of a proposal's last push after push number ``after``, from the present journal; None without such a push."""
+        """Return the outcome of a proposal's last push after push number ``after``, from the present journal; None if there is none."""
         return JournalView.read(self._store, self._machine).of_proposal(proposal, after)
 
     async def _record_pushed(self, alarm: int, proposal: int, after: int, done: JobOutcome) -> None:

@@ -1,4 +1,4 @@
-"""Run a job, report its progress to watchers, and record its begin, its end, or that the service stopped during it.
+"""Run a job, report its progress to watchers, and record its beginning, its end, or that the service stopped during it.
 
 Checks, full campaigns, investigations, pushes and rollbacks are each a `Job`; `carry_out` runs any of them (decision 0039).
 """

@@ -92,7 +92,7 @@ CLOCK_CHANGE = timedelta(hours=3)
 """No zone changes its clocks by more than this."""
 
 _STRIDE = timedelta(days=7)
-"""No zone changes its clocks and back again within this."""
+"""No zone changes its clocks twice within this time."""
 
 _SECOND = timedelta(seconds=1)
 

@@ -47,7 +47,7 @@ NEEDED: tuple[tuple[Condition, type[Interlock], str], ...] = (
 )
 
 AT_WORK = frozenset({"door"})
-"""Conditions that mounting may cause; nothing moves during it."""
+"""Conditions that mounting may cause; nothing moves while a person mounts."""
 PAUSED = frozenset({"door", "mode", "drives", "program", "spindle", "temperature", "beam"})
 """Conditions that a person may cause during a pause; checked again before the measurement resumes."""
 CAN_CLEAR = frozenset({"door", "beam", "temperature"})

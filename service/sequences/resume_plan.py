@@ -261,7 +261,7 @@ class ResumeTrail:
 
     @property
     def n_features(self) -> int:
-        """Number of carried features; a qualification sphere is none."""
+        """Number of carried features; a qualification sphere does not count."""
         return sum(one.get("u_sphere_mm") is None for one in self.carried)
 
 
@@ -355,7 +355,7 @@ def _after_point(test: TestPlan, first: int, records: tuple[dict[str, Any], ...]
 
 
 def _after_feature(test: TestPlan, records: tuple[dict[str, Any], ...]) -> Rest:
-    """Resume an artefact at the next feature, after its references were touched again. The stylus leaves a feature by itself."""
+    """Resume an artefact at the next feature, after its references were touched again. A touch ends above its feature: no way back."""
     touches = [(k, s) for k, s in enumerate(test.steps) if isinstance(s, TouchFeature)]
     done = min(len(records), len(touches) - 1)  # the last one is a reference
     first, again = touches[done][0], references_of(s for _, s in touches[:done])

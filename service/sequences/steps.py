@@ -202,7 +202,7 @@ class TestPlan:
 
     @property
     def bar(self) -> BarSetup:
-        """The set-up of a ball-bar test; AssertionError for another."""
+        """The set-up of a ball-bar test; AssertionError for another test."""
         assert isinstance(self.setup, BarSetup), self.test
         return self.setup
 

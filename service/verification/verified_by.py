@@ -211,7 +211,7 @@ def _measured_with(store: Store, record: VerificationRecord, crc: int | None, si
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """Return when a check's campaign began, or the check if it has no campaign; `--accept-table` accepts a table before this time."""
+    """Return when a check's campaign began, or when the check began if it has no campaign; `--accept-table` accepts a table earlier."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)

@@ -39,7 +39,7 @@ ALARM_FIELDS = (("Code", _TEXT), ("Device", _TEXT))
 
 @dataclass(frozen=True, slots=True)
 class Types:
-    """Types of one server, and where it shows the machine. ``tools``: index of the companion specification's namespace, None without."""
+    """Types of one server, and where it shows the machine. ``tools``: index of the companion specification's namespace, None if missing."""
 
     objects: dict[str, ua.NodeId]
     result_event: Node

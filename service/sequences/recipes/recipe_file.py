@@ -216,8 +216,8 @@ def recipe_text(name: str, recipes: tuple[Recipe, ...], note: str = "") -> str:
 
 
 def _toml(value: Any) -> str:
-    """Format a TOML value. Text, numbers and their lists are JSON, which is TOML except for the ASCII DEL; a list of tables has one a
-    line."""
+    """Format a TOML value. Text, numbers and their lists are JSON, which is TOML except for the ASCII DEL; a list of tables has one
+    table on each line."""
     if isinstance(value, BaseModel):
         value = value.model_dump(by_alias=True, exclude_none=True)
     if isinstance(value, dict):

@@ -30,7 +30,7 @@ ONLY_GROWS_SQLITE = (
     BEGIN SELECT RAISE(ABORT, 'the audit only grows'); END
     """,
 )
-"""REPLACE deletes rows without a delete trigger."""
+"""The third trigger is for REPLACE, which deletes rows without a delete trigger."""
 
 NAMING = {
     "pk": "pk_%(table_name)s",
