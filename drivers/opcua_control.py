@@ -4,7 +4,7 @@ A plug-in of `abbe.drivers.registry` (entry point ``opc.tcp``) that needs the ex
 
     opc.tcp://192.168.0.40:4840/?x=ns%3D2%3Bs%3DX&y=ns%3D2%3Bs%3DY&z=ns%3D2%3Bs%3DZ&moving=ns%3D2%3Bs%3DMoving&unit=mm
 
-``moving`` (a Boolean node; optional) shows whether an axis moves. The unit is that of the nodes' EngineeringUnits (UNECE code). ``unit``
+``moving`` (a Boolean node; optional) shows whether an axis moves. The nodes' EngineeringUnits (UNECE code) give the unit. ``unit``
 (mm, um, m, in) states the unit of nodes without EngineeringUnits, and must not contradict others. Values without good quality are refused.
 
 By default the session is anonymous and not encrypted: use such a session only in the machine's own network. ``certificate``, ``key`` (PEM,

@@ -114,7 +114,7 @@ def report(machine: Machine, correction: Correction, nodes: int, *, arrows: bool
 
 
 def plane_rms_um(machine: Machine, correction: Correction, box_mm: list[float]) -> float:
-    """Return the rms deviation in a plane of X and Y, µm, rigid motion in it removed. ``box_mm``: lowest and highest X, same of Y, Z."""
+    """Return the rms deviation in a plane of X and Y, µm, rigid motion in it removed. ``box_mm``: lowest and highest X, then Y, and Z."""
     x0, x1, y0, y1, z = box_mm
     axes = np.meshgrid(np.linspace(x0, x1, FINE_NODES), np.linspace(y0, y1, FINE_NODES), indexing="ij")
     points = np.stack([*axes, np.full(axes[0].shape, z)], axis=-1).reshape(-1, 3)

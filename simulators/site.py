@@ -52,7 +52,7 @@ TICK_S = 0.005
 REST_S = 0.2
 """Time between two ticks while nothing streams or is buffered. This suffices because every request brings the world up to date."""
 AHEAD_S, AHEAD_SAMPLES = 10.0, 2000
-"""Largest lead, in s of simulated time and in samples, of a world faster than real time over a host that polls the controller."""
+"""How far a world faster than real time may run ahead of a host that polls the controller: s of simulated time, samples."""
 WAITS_S = 0.5
 """Longest wait for the next poll, s of wall time; after a second without samples the host would report a silent box."""
 BALLBAR_LINK, LASER_LINK = "ballbar", "laser"

@@ -183,7 +183,7 @@ class BarProbe:
             raise
         seq, device_us, reading_nm, status = batch.samples[-1]
         if not bar_is_valid(status):
-            raise DeviceFault(self.name, "read", ", ".join(bar_reasons(status)), "hang the bar in, move into its range")
+            raise DeviceFault(self.name, "read", ", ".join(bar_reasons(status)), "mount the bar, then move into its range")
         return Sample(batch.host_s, device_us * 1e-6, seq, {"radius": reading_nm * 1e-6})
 
     async def raw(self) -> Mapping[str, tuple[int, ...]]:

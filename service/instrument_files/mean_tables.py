@@ -30,7 +30,7 @@ Table = tuple[list[float], list[float], list[str], list[int]]
 
 
 def read_pos(name: str, data: bytes) -> Content:
-    """Read a .pos of an API laser: tables of mean deviations, mm. A forward and a reverse table become one test, approached from both sides.
+    """Read a .pos of an API laser: tables of mean deviations, mm. A forward and a reverse table become one test with both approaches.
 
     Raises
     ------

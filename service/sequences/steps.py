@@ -37,7 +37,7 @@ class TakeBarOut:
 
 @dataclass(frozen=True, slots=True)
 class ChangeBar:
-    """A person hangs another bar in at the same cup; the machine stands at the start of its path."""
+    """A person mounts another bar at the same cup; the machine stands at the start of its path."""
 
     radius_mm: float
 

@@ -241,7 +241,7 @@ class Controller:
         self.probe_fitted: Callable[[], bool] = lambda: False
         self.deflected: Callable[[], bool] = lambda: False
         self.latch_mm: F | None = None
-        """Position at which the probe tripped in the last touch, None without a trip; ``latch_s``: time of the trip."""
+        """Position at which the probe tripped in the last touch, None if it did not trip; ``latch_s``: time of the trip."""
         self.latch_s = 0.0
         self._trip_mm: F | None = None
         self._crash = False

@@ -244,7 +244,7 @@ def indistinct(fitted: FittedRuns, projector: Projector, left: F, own: str) -> l
 
 
 ALL_EFFECTS = (drive, instrument, outside, structure, thermal)
-"""Imported so that their effects are registered."""
+"""Modules that are imported so that their effects are registered."""
 SNR_LOCAL = (0.6, 8.0)
 TOUCHED = 0.1
 """A reading is touched if the part of the effect that the model cannot absorb, divided by the noise, exceeds this fraction of its

@@ -7,7 +7,7 @@ from abbe.simulators.hidden.effect import MRAD, PPM, UM, URAD, Bend, Hidden, eff
 from abbe.simulators.hidden.track import Track
 
 AIR_PPM_PER_K = -0.93
-"""Warmer air is thinner: the wavelength is longer than the laser assumes, and the laser counts fewer waves on the same path."""
+"""Change of a reading, ppm/K: in warmer, thinner air the wavelength is longer, so the laser counts fewer waves on the same path."""
 DEAD_PATH_MM = 900.0
 
 

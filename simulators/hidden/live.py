@@ -29,7 +29,7 @@ NEEDED = {
 """Parameters that an effect needs besides ``strength``."""
 VERTICAL = 2
 PARTS = (drive, outside, structure, thermal)
-"""Imported so that their effects are registered."""
+"""Modules that are imported so that their effects are registered."""
 
 
 def live_of(config: HiddenConfig, low_mm: F, high_mm: F) -> "Live | None":

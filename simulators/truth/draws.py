@@ -126,7 +126,7 @@ class Draws:
 
 
 def draw_machine(scenario: Scenario) -> Draws:
-    """Draw one machine. Same seed and magnitudes, same machine."""
+    """Draw one machine. Equal seeds and magnitudes give the same machine."""
     sizes = scenario.magnitudes
     rng = generator(scenario.seed, STREAM_TRUTH)
     scale = rng.normal(scale=sizes.scale_sd_um_per_m * 1e-6, size=3)

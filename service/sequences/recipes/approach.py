@@ -133,8 +133,8 @@ class CupTest(TestRecipe):
 
     ``opens``: the pole is on the positive (1) or negative (-1) side of ``axis``, where the spindle is.
     ``u_length_mm``: standard uncertainty of the bar's length on its certificate; not ``length_calibrated``: the length was never measured.
-    ``change_bar``: the previous test had another radius; the cup stays, a person takes the bar out before the machine moves and hangs the
-    other one in at the start of its path. ``link_mm``: end of the previous test, if this one starts elsewhere on the same sphere.
+    ``change_bar``: the previous test had another radius; the cup stays, a person takes the bar out before the machine moves and mounts the
+    other one at the start of its path. ``link_mm``: end of the previous test, if this one starts elsewhere on the same sphere.
     """
 
     centre_mm: tuple[Coordinate, Coordinate, Coordinate]
