@@ -105,7 +105,7 @@ class HiddenConfig:
 
 @dataclass(frozen=True, slots=True)
 class ArtefactConfig:
-    """The plate that the fixture can put on the table. ``kind``: ``hole_plate`` or ``ball_plate``; the other fields: sizes of its random draws."""
+    """The plate that the fixture can put on the table: ``kind`` is ``hole_plate`` or ``ball_plate``; then sizes of its random draws."""
 
     kind: str = "hole_plate"
     columns: int = 4
