@@ -102,7 +102,7 @@ class PlateUnderProbe:
         return bool(self.fitted and self._free(tip_mm[None, :], time_s)[0] < -0.5 * self.stylus.pretravel_mm)
 
     def contact(self, length_mm: float, way: F, tip: Tip, time_s: float) -> float | None:
-        """Return the length of a straight move, mm, after which the probe trips; None if it never does. ``way``: unit vector of the move."""
+        """Return the length of a straight move, mm, after which the probe trips; None if never. ``way``: unit vector of the move."""
         if not self.fitted:
             return None
         if self.stylus.false_trips:
