@@ -94,7 +94,7 @@ def is_plain(path: Path) -> bool:
 
 
 def replace_file(path: Path, body: bytes) -> None:
-    """Replace a file at once and for good: after a power cut it is the old or the new one. Its rights, and where possible its owner, stay.
+    """Replace a file: after a power cut it is the old or the new one, never a part. Its rights, and where possible its owner, stay.
 
     A link stays a link: the file that it leads to is replaced. Raises OSError: the old file is untouched. A folder that cannot be
     flushed is no error: the new file is in place, and a power cut in the next seconds may bring the old one back.

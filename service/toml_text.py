@@ -20,7 +20,7 @@ _LEFT = re.compile(rf"[ \t]*{_NAME}(?:[ \t]*\.[ \t]*{_NAME})*[ \t]*=")
 _PART = re.compile(r"([^.\[\]]+)(?:\[([1-9]\d*)\])?")
 _BARE = re.compile(r"[A-Za-z0-9_-]+")
 Path = tuple[str | int, ...]
-"""Keys; the key of a list of tables is followed by the number of the table, from 0."""
+"""Keys that lead to a value; the key of a list of tables is followed by the number of the table, from 0."""
 
 
 class NotEditableError(ValueError):

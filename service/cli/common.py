@@ -83,7 +83,7 @@ def machine_file(given: Path | None) -> Path:
 
 
 def database_url(db: str | None, machine: Path | None = None) -> str:
-    """Return the database of a command: ``--db``, else that of the named machine file, else the environment's, else the default.
+    """Return the database of a command: ``--db``, else the database of the named machine file, else the environment's, else the default.
 
     Raises
     ------

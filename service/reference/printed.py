@@ -144,7 +144,7 @@ class Computed:
 def fit(computed: Computed, number: Expected) -> Fit:
     """Return how a computed number agrees with the printed one.
 
-    A bound limits the absolute value. As it is rounded itself, the value may exceed it by half a unit of its last digit.
+    A bound limits the absolute value. The printed bound is rounded, so the value may exceed it by half a unit of the bound's last digit.
     """
     slack = FLOAT * max(abs(computed.value), abs(number.value))
     if number.bound:

@@ -226,7 +226,8 @@ def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict
 
 
 def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:
-    """Return the temperature at which the new table holds: that of the scales in the table's runs. Tables are not reduced to 20 °C."""
+    """Return the temperature at which the new table holds: the scales' temperature during the table's runs. Tables are not reduced to 20
+    °C."""
     solution_id = store.tables.get(known.table).solution_id if known.table else None
     if solution_id is None:
         return {}

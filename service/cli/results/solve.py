@@ -175,7 +175,7 @@ class _SolveRequest:
 
 @contextmanager
 def stored_campaign(name: str, url: str) -> Iterator[tuple[Store, Campaign]]:
-    """Yield the store and its campaign of that name. Raises StoreError for a name of neither a campaign nor a folder."""
+    """Yield the store and its campaign of that name. Raises StoreError if there is no such campaign."""
     from abbe.service.errors import StoreError
 
     with ExitStack() as stack:

@@ -234,7 +234,7 @@ def _largest() -> list[Comparison]:
         found = _on_grid(c, used, lambda s: 1e3 * s.largest)
         near = abs(found.value - number.value) <= paper.RESIDUAL_UM.value
         why = (
-            f"within the stated residuals of ± {paper.RESIDUAL_UM.text} µm, if the paper's figure is that of the readings"
+            f"within the stated residuals of ± {paper.RESIDUAL_UM.text} µm, if the paper took its figure from the readings"
             if near
             else f"beyond the stated residuals of ± {paper.RESIDUAL_UM.text} µm: Table 1 does not give the figure of the text"
         )

@@ -156,20 +156,20 @@ def _points(law: Law, turns: int, radius_mm: float = RADII_MM[0]) -> F2:
 def _six(part: VectorCase, checks: Checks, points: F2) -> None:
     a = design_eq9(points, ORIGIN, setup=False)
     found, sigma = conditioning(a), spread(a)
-    checks.compare("rank, six", found.rank, part.at("rank"), unit="1")
-    checks.compare("condition, six", found.condition, part.at("cond"), unit="1")
-    checks.compare("singular values, six", found.singular_values, part.at("sv"), unit="1")
-    checks.compare("largest correlation, six", sigma.largest_correlation, part.at("max_corr"), unit="1")
-    checks.compare("sigma per µm, six", sigma.sigma_per_mm * PER_UM, part.at("sigma_factor_per_um"), unit="1", floor=1e-20)
+    checks.compare("rank, six unknowns", found.rank, part.at("rank"), unit="1")
+    checks.compare("condition, six unknowns", found.condition, part.at("cond"), unit="1")
+    checks.compare("singular values, six unknowns", found.singular_values, part.at("sv"), unit="1")
+    checks.compare("largest correlation, six unknowns", sigma.largest_correlation, part.at("max_corr"), unit="1")
+    checks.compare("sigma per µm, six unknowns", sigma.sigma_per_mm * PER_UM, part.at("sigma_factor_per_um"), unit="1", floor=1e-20)
 
 
 def _ten(part: VectorCase, checks: Checks, a: F2) -> None:
     nine = conditioning(a[:, :9])
-    checks.compare("rank, ten", conditioning(a).rank, part.at("rank10"), unit="1")
-    checks.compare("rank, nine", nine.rank, part.at("rank9"), unit="1")
-    checks.compare("condition, nine", nine.condition, part.at("cond9"), unit="1")
+    checks.compare("rank, ten unknowns", conditioning(a).rank, part.at("rank10"), unit="1")
+    checks.compare("rank, nine unknowns", nine.rank, part.at("rank9"), unit="1")
+    checks.compare("condition, nine unknowns", nine.condition, part.at("cond9"), unit="1")
     sigma = spread(a[:, :9]).sigma_per_mm * PER_UM
-    checks.compare("sigma per µm, nine", sigma, part.at("sigma9_per_um"), unit="1", floor=1e-20, relative=1e-9, rounding=INVERTED)
+    checks.compare("sigma per µm, nine unknowns", sigma, part.at("sigma9_per_um"), unit="1", floor=1e-20, relative=1e-9, rounding=INVERTED)
     trace = common_scale_trace_mm(a, RADII_MM[0])
     checks.compare(
         "trace of the common scale", trace, part.at("null_residual"), unit="mm", floor=3e-13, rounding="0 but for rounding at 175 mm"

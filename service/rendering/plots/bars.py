@@ -13,7 +13,7 @@ from abbe.service.rendering.svg import Svg
 WIDTH, ROW, TOP, BOTTOM = 500.0, 22.0, 34.0, 46.0
 LABELS = 150.0
 SETUP_LABELS = 192.0
-"""Width of the column for names of parameters, those of set-ups among them, in the longest language."""
+"""Width of the column for names of parameters, set-up parameters included, in the longest language."""
 FIGURES = 130.0
 """Width of the column for value and uncertainty of a ranking."""
 STATUS_STYLES = {"observed": "f-c1", "weak": "f-c3"}

@@ -63,7 +63,7 @@ class TimeLimitedProtocol(H11Protocol):
         self._watch()
 
     def on_response_complete(self) -> None:
-        """Wait for the next request; for the rest of a request that was answered early, only `LINGER_S`."""
+        """Wait for the next request. Wait only `LINGER_S` for the rest of a request that was answered early."""
         self.silent_since_s = self.loop.time()
         super().on_response_complete()
         self._watch()

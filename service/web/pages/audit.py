@@ -72,7 +72,7 @@ DEEDS: Mapping[str, tuple[str, ...]] = MappingProxyType(
         "demo": ("abbe demo",),
     }
 )
-"""The recorded actions of each deed; the catalogues name the deed under ``deed``."""
+"""The recorded actions of each deed; the catalogues translate a deed under the key ``deed.NAME``."""
 _OF = {action: deed for deed, actions in DEEDS.items() for action in actions}
 _ENDS = {"done": "ok", "kept": "ok", "refused": "bad", "failed": "bad", "rolled back": "bad"}
 _JOB = re.compile(r"^job [0-9a-f]+(, )?")

@@ -1,4 +1,5 @@
-"""The screen of one check: verdict, a gauge for each figure, curves over those of the last check that passed, alarms, next step, report."""
+"""The screen of one check: verdict, a gauge for each figure, curves drawn over the curves of the last check that passed, alarms, next step,
+report."""
 
 from __future__ import annotations
 

@@ -16,7 +16,7 @@ from abbe.service.web.frame import current
 
 Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many", "times"]
 """``optional``: a text that may be absent; ``maybe``: a number that may be absent; ``range``: two numbers; ``yes``: yes or no;
-``many``: boxes to tick; ``times``: days and a time of day, or a cron expression, or neither."""
+``many``: boxes to tick; ``times``: days and a time of day, a cron expression, or nothing."""
 _NUMBER = re.compile(r"-?(0|[1-9]\d*)(\.\d+)?([eE][+-]?\d+)?")
 _KEY = re.compile(r"\b(issuer|item|verify|limits|calibration|schedule)(?:\[([^\]]*)\])?(\.[a-z_.]*[a-z_])")
 ENDS = ("low", "high")

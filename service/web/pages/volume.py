@@ -29,7 +29,7 @@ NOTHING = Markup("")
 
 @dataclass(frozen=True, slots=True)
 class VolumeQuery:
-    """The requested view. ``at``: index of the slice from 0, -1: the middle; ``motions``: none means all."""
+    """The requested view. ``at``: index of the slice, from 0; -1 for the middle one. ``motions``: the chosen ones; empty for all."""
 
     motions: tuple[str, ...] = ()
     plane: str = "XY"
