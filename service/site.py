@@ -7,11 +7,9 @@ from dataclasses import dataclass, field
 from datetime import date
 from typing import Any
 
-import numpy as np
-
-from abbe.models.machine import AXES, Machine
+from abbe.models.machine import Machine
 from abbe.service.config_schema import MachineFile
-from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, control_of
+from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, control_of, machine_from_doc
 from abbe.service.domain.machine_file import CaptureSettings
 from abbe.service.errors import TableRefused
 from abbe.service.push.validate import PushLimits
@@ -26,8 +24,7 @@ class Site:
     ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``; one without a certificate is absent.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
     stated temperature of the scales by axis. ``room_c``: range of the air temperature that a person states for a machine without a
-    laser, by the room's own thermometer; valid until the day ``room`` of ``calibrated_until``. ``control``: identity of the control
-    (`control_of`); empty without a control.
+    laser, by the room's own thermometer; valid until the day ``room`` of ``calibrated_until``.
     """
 
     name: str
@@ -44,43 +41,11 @@ class Site:
     two_people: bool = False
     materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
     room_c: tuple[float, float] | None = None
-    control: str = field(init=False)
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "control", control_of(self.urls.cnc))
-
-
-def machine_from_doc(doc: dict[str, Any]) -> Machine:
-    """Return the nominal geometry of a machine object (docs/schemas/machine.schema.json); pivots and tool default to zero.
-
-    Raises
-    ------
-    ValueError
-        A key is missing or impossible; the message names it.
-    """
-    try:
-        stroke = np.array([doc["stroke_mm"][a] for a in AXES], dtype=np.float64)
-    except KeyError as missing:
-        raise ValueError(f"machine: {missing} is missing") from None
-    pivots = doc.get("pivots_mm") or {}
-    return Machine(
-        doc["chain"],
-        stroke,
-        np.array([pivots.get(a) or (0.0, 0.0, 0.0) for a in AXES], dtype=np.float64),
-        np.array(doc.get("tool_mm") or (0.0, 0.0, 0.0), dtype=np.float64),
-    )
-
-
-def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[str, Any]:
-    """Return the machine object (docs/schemas/machine.schema.json) for a nominal geometry."""
-    return {
-        "name": name,
-        "chain": machine.chain,
-        "vertical_axis": vertical_axis,
-        "stroke_mm": {a: [float(v) for v in machine.stroke_mm[k]] for k, a in enumerate(AXES)},
-        "pivots_mm": {a: [float(v) for v in machine.pivots_mm[k]] for k, a in enumerate(AXES)},
-        "tool_mm": [float(v) for v in machine.tool_mm],
-    }
+    @property
+    def control(self) -> str:
+        """Identity of the control, as its journal of tables names it; empty without a control."""
+        return control_of(self.urls.cnc)
 
 
 def site_of(config: MachineFile) -> Site:

@@ -9,12 +9,12 @@ from abbe.models.machine import Machine
 from abbe.models.planning.search import COVERAGE
 from abbe.public.answers import Picture
 from abbe.service.campaigns.plan import PlannedCampaign, describe, plan_for, plan_picture, plan_report, read_instruments
-from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls, machine_doc
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.files import write_page
 from abbe.service.rendering.document_page import write_document
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 
 NAME = "planned"
 

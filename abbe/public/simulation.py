@@ -17,7 +17,7 @@ from abbe.models.functions.motions import ErrorMotions
 from abbe.models.geometry.chain import deviation_mm
 from abbe.models.machine import Machine
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls, machine_doc
 from abbe.service.domain.run import Columns, Run
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT
 from abbe.service.effects.effect_catalogue import catalogue, checked
@@ -25,7 +25,7 @@ from abbe.service.errors import EffectUnknown, Unusable
 from abbe.service.runs.cases import path_of
 from abbe.service.sequences.recipes.recipe import Recipe
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, ReadBar, ReadLaser, RecordPath, TestPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 
 NAME = "simulated"
 SETUP_S = 300.0

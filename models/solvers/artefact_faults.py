@@ -12,8 +12,7 @@ from abbe.models.arrays import F1
 from abbe.models.solvers.artefact import LETTERS, ArtefactPoints, step_columns
 from abbe.models.solvers.artefact_shares import form_amounts
 from abbe.models.solvers.components import KINDS
-from abbe.models.solvers.engine import CampaignFit, CampaignProblem
-from abbe.models.solvers.fine import Score
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Score
 from abbe.models.solvers.joint import JointSolution
 from abbe.models.solvers.observability.poses import NAMED, SWIRL
 from abbe.models.solvers.observations import RunData

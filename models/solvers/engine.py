@@ -162,6 +162,44 @@ class CampaignFit:
     parts: tuple[InformationSums, ...]
 
 
+@dataclass(frozen=True)
+class Score:
+    """Part of the residuals that further unknowns would explain (Rao's score)."""
+
+    weight: F1
+    left: F1
+    scaled: F2
+    covariance: F2
+    sigma: F1
+
+    @classmethod
+    def of(cls, problem: CampaignProblem, fit: CampaignFit) -> Score:
+        """Prepare the score of a fit."""
+        kind = problem.readings.kind
+        weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
+        root = fit.sizes.root * fit.components.half(fit.sizes)
+        return cls(weight, fit.residual_mm / problem.sigma, problem.readings.a @ root, fit.posterior.cov, problem.sigma)
+
+    def asked(self, columns: F2) -> tuple[F1, F2]:
+        """Derivative of the log evidence by the unknowns of these columns, (k,), and its information, (k, k)."""
+        b = columns / self.sigma[:, None]
+        weighted = b * self.weight[:, None]
+        across = weighted.T @ self.scaled
+        return weighted.T @ self.left, b.T @ weighted - across @ self.covariance @ across.T
+
+    def excess(self, columns: F2) -> float:
+        """Score for a common variance of the unknowns, in standard deviations."""
+        asked, information = self.asked(columns)
+        return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
+
+    def gain_rescaled(self, columns: F2) -> float:
+        """Gain of log evidence by unknowns of size 1 in these columns if the noise is estimated anew."""
+        asked, information = self.asked(columns)
+        whole = np.eye(len(asked)) + information
+        explained = float(asked @ np.linalg.solve(whole, asked)) / max(float(self.weight @ self.left**2), 1e-12)
+        return -0.5 * self.left.size * float(np.log(max(1.0 - explained, 0.02))) - 0.5 * float(np.linalg.slogdet(whole)[1])
+
+
 def expected_noise(runs: tuple[RunData, ...], sigma_mm: dict[str, float] | None, floor_mm: dict[str, float] | None) -> InstrumentNoise:
     """Noise stated by the caller, else from repeats, else `DEFAULT_SIGMA_MM`."""
     repeats = {kind: repeat_noise_mm(runs, kind) for kind in KINDS}

@@ -9,14 +9,14 @@ probability: features stand at multiples of a pitch, so several periods often ex
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from abbe.models.arrays import F1, F2
+from abbe.models.arrays import F2
 from abbe.models.solvers.artefact import SAME_PLACE_MM, Fine
 from abbe.models.solvers.components import KINDS
-from abbe.models.solvers.engine import CampaignFit, CampaignProblem
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Score
 from abbe.models.solvers.observations import RunData
 from abbe.models.solvers.waves import Displacements, Peak, peaks
 
@@ -26,44 +26,6 @@ NUGGETS, NOISY = 3.0, 1.4
 of probed points is `NOISY` times their repeatability."""
 SURE, ROUNDS = 0.8, 3
 """After a period of at least the probability `SURE`, further ones are searched for, in at most `ROUNDS` searches."""
-
-
-@dataclass(frozen=True)
-class Score:
-    """Part of the residuals that further unknowns would explain (Rao's score)."""
-
-    weight: F1
-    left: F1
-    scaled: F2
-    covariance: F2
-    sigma: F1
-
-    @classmethod
-    def of(cls, problem: CampaignProblem, fit: CampaignFit) -> Score:
-        """Prepare the score of a fit."""
-        kind = problem.readings.kind
-        weight = fit.weight * np.exp(-fit.components.eta)[kind] / fit.decimation[kind]
-        root = fit.sizes.root * fit.components.half(fit.sizes)
-        return cls(weight, fit.residual_mm / problem.sigma, problem.readings.a @ root, fit.posterior.cov, problem.sigma)
-
-    def asked(self, columns: F2) -> tuple[F1, F2]:
-        """Derivative of the log evidence by the unknowns of these columns, (k,), and its information, (k, k)."""
-        b = columns / self.sigma[:, None]
-        weighted = b * self.weight[:, None]
-        across = weighted.T @ self.scaled
-        return weighted.T @ self.left, b.T @ weighted - across @ self.covariance @ across.T
-
-    def excess(self, columns: F2) -> float:
-        """Score for a common variance of the unknowns, in standard deviations."""
-        asked, information = self.asked(columns)
-        return float((asked @ asked - np.trace(information)) / np.sqrt(2.0 * np.sum(information * information)))
-
-    def gain_rescaled(self, columns: F2) -> float:
-        """Gain of log evidence by unknowns of size 1 in these columns if the noise is estimated anew."""
-        asked, information = self.asked(columns)
-        whole = np.eye(len(asked)) + information
-        explained = float(asked @ np.linalg.solve(whole, asked)) / max(float(self.weight @ self.left**2), 1e-12)
-        return -0.5 * self.left.size * float(np.log(max(1.0 - explained, 0.02))) - 0.5 * float(np.linalg.slogdet(whole)[1])
 
 
 def refined(problem: CampaignProblem, fit: CampaignFit, solve: Solve) -> tuple[CampaignProblem, CampaignFit]:

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1, F2
-from abbe.models.solvers.engine import CampaignFit, CampaignProblem
-from abbe.models.solvers.fine import Score
+from abbe.models.solvers.engine import CampaignFit, CampaignProblem, Score
 
 CLEAR = 8.0
 """A change is stated if its log evidence is this much above no change, a changing bar and a changing laser: four standard deviations."""

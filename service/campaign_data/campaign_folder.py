@@ -9,7 +9,7 @@ from typing import Any
 
 from abbe.service.campaign_data.provenance import machine_digest, run_digest
 from abbe.service.domain.document import record
-from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls, machine_from_doc
 from abbe.service.domain.measured import CampaignHead
 from abbe.service.domain.run import Run
 from abbe.service.domain.run_file import CAMPAIGN_FORMAT
@@ -19,7 +19,7 @@ from abbe.service.runs.checks import read_json
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.exchange import import_folder, read_folder, write_folder
 from abbe.service.runs.observations import with_earliest_mounting
-from abbe.service.site import Site, machine_from_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 
 

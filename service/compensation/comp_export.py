@@ -23,6 +23,7 @@ from abbe.models.arrays import F1
 from abbe.models.machine import AXES, Machine
 from abbe.models.uncertainty.scales import SCALE_TEXTS, Scales, scale_projection
 from abbe.service.config_schema import MachineFile
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.errors import FileFormatError, FormatRefused, SignatureRefused, TableFileError
 from abbe.service.files import NotPlainError, read_plain, write_page
@@ -33,7 +34,7 @@ from abbe.service.formats.model import Compensation, negated
 from abbe.service.formats.registry import FORMATS, format_of
 from abbe.service.signed import keys
 from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
-from abbe.service.site import machine_from_doc, site_of
+from abbe.service.site import site_of
 from abbe.service.verification.reduction import UNKNOWN
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20

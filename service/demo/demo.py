@@ -20,13 +20,14 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.demo.simulator_process import SealedTruth, SimulatorProcess, running_simulators, sealed_truth
 from abbe.service.devices.session import Session, open_session
+from abbe.service.domain.machine import machine_doc
 from abbe.service.domain.progress import Progress, ProgressSink
 from abbe.service.machine_text import machine_text
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.recipes.recipe import CLEARANCE_MM
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.verification.verify import figure_rows
 

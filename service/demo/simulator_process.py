@@ -19,10 +19,9 @@ from abbe.models.machine import Machine
 from abbe.service.children import python_command
 from abbe.service.domain.artefact import ArtefactObject
 from abbe.service.domain.document import Doc, parsed, record
-from abbe.service.domain.machine import DeviceUrls
+from abbe.service.domain.machine import DeviceUrls, machine_from_doc
 from abbe.service.domain.run import Matrix
 from abbe.service.errors import AbbeError
-from abbe.service.site import machine_from_doc
 
 READY_S = 30.0
 STOP_S = 3.0

@@ -7,10 +7,13 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, field
 from datetime import date
-from typing import Annotated, Literal, Self
+from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from urllib.parse import parse_qs, urlsplit
 
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field
+
+if TYPE_CHECKING:
+    from abbe.models.machine import Machine
 
 Name = Annotated[str, Field(min_length=1, max_length=200)]
 Role = Literal["identify", "holdout", "sealed"]
@@ -209,3 +212,40 @@ class Rules:
     instruments: dict[str, str] = field(default_factory=dict)
     issuer: Issuer | None = None
     item: Item | None = None
+
+
+def machine_from_doc(doc: dict[str, Any]) -> Machine:
+    """Return the nominal geometry of a machine object (docs/schemas/machine.schema.json); pivots and tool default to zero.
+
+    Raises
+    ------
+    ValueError
+        A key is missing or impossible; the message names it.
+    """
+    import numpy as np  # here: lists of what is stored need no numpy
+
+    from abbe.models.machine import AXES, Machine
+
+    try:
+        stroke = np.array([doc["stroke_mm"][a] for a in AXES], dtype=np.float64)
+    except KeyError as missing:
+        raise ValueError(f"machine: {missing} is missing") from None
+    pivots = doc.get("pivots_mm") or {}
+    return Machine(
+        doc["chain"],
+        stroke,
+        np.array([pivots.get(a) or (0.0, 0.0, 0.0) for a in AXES], dtype=np.float64),
+        np.array(doc.get("tool_mm") or (0.0, 0.0, 0.0), dtype=np.float64),
+    )
+
+
+def machine_doc(name: str, machine: Machine, vertical_axis: str = "Z") -> dict[str, Any]:
+    """Return the machine object (docs/schemas/machine.schema.json) for a nominal geometry."""
+    return {
+        "name": name,
+        "chain": machine.chain,
+        "vertical_axis": vertical_axis,
+        "stroke_mm": {a: [float(v) for v in machine.stroke_mm[k]] for k, a in enumerate("XYZ")},
+        "pivots_mm": {a: [float(v) for v in machine.pivots_mm[k]] for k, a in enumerate("XYZ")},
+        "tool_mm": [float(v) for v in machine.tool_mm],
+    }

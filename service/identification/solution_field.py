@@ -12,10 +12,10 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.uncertainty.coverage import apart_from_zero
 from abbe.models.uncertainty.known_field import KnownField, field_map
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotObservable, Unusable
-from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from abbe.service.verification.deviations import standard_uncertainty_mm
 

@@ -18,12 +18,11 @@ from abbe.models.geometry.propagation import Points, deviation_covariance
 from abbe.models.machine import AXES, Machine
 from abbe.service.config import load_machine, read_toml
 from abbe.service.config_schema import MachineFile
-from abbe.service.domain.machine import MachineObject
+from abbe.service.domain.machine import MachineObject, machine_from_doc
 from abbe.service.errors import ConfigError, FileFormatError, nearest
 from abbe.service.runs.checks import check, read_json
 from abbe.service.runs.errors_file import KnownErrors, read_errors
 from abbe.service.runs.points import POSITION, TOOL, PointsFile, read_points
-from abbe.service.site import machine_from_doc
 
 FORMAT = "abbe-deviations/1"
 CONVENTION = "actual minus nominal, tool relative to workpiece; rigid motion not removed; squareness counts from axis zero"

@@ -19,10 +19,11 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
+from abbe.service.domain.machine import machine_doc
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, Helix, Linear
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from tests.faults.sequencer_world import MACHINE
 

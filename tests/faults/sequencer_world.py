@@ -21,12 +21,13 @@ from abbe.drivers.api import BarBatch
 from abbe.models.machine import Machine
 from abbe.service.devices.session import DeviceUrls, Session, open_session
 from abbe.service.domain.artefact import ArtefactObject
+from abbe.service.domain.machine import machine_doc
 from abbe.service.sequences.check import step_seconds
 from abbe.service.sequences.control import Control, State, Watching
 from abbe.service.sequences.recipes import recipe as recipes
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import CampaignPlan, MoveTo, RecordPath, TestPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.simulators.cnc.log import Command
 from abbe.simulators.scenario import Scenario

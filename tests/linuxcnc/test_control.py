@@ -21,8 +21,9 @@ from abbe.models.compensation.tables import NineTables
 from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.pushing import Pushing, PushResult, Questions, WantedTable
 from abbe.service.devices.session import DeviceUrls
+from abbe.service.domain.machine import machine_doc
 from abbe.service.push.operations import VerificationResult
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from tests.linuxcnc.instance import Instance

@@ -28,12 +28,13 @@ from abbe.service.compensation.commission_levels import commission_levels
 from abbe.service.compensation.proposals import change_of
 from abbe.service.devices.session import DeviceUrls, Session
 from abbe.service.domain.artefact import ArtefactObject
+from abbe.service.domain.machine import machine_doc
 from abbe.service.errors import MissedContact
 from abbe.service.identification.solve import solve_runs
 from abbe.service.sequences.control import Watching
 from abbe.service.sequences.recipes.artefact import ArtefactTest
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.verification.verify import pose_figures
 from tests.linuxcnc.instance import Instance

@@ -11,7 +11,8 @@ import pytest
 
 from abbe.models.solvers.observations import RunData
 from abbe.service.devices.session import DeviceUrls
-from abbe.service.site import Site, machine_doc
+from abbe.service.domain.machine import machine_doc
+from abbe.service.site import Site
 from tests.experiments.campaigns import population
 
 Doc = dict[str, Any]

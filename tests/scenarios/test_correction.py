@@ -19,13 +19,14 @@ from abbe.service.compensation.gate import PushContext
 from abbe.service.compensation.proposals import load_runs
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, Session, open_session
+from abbe.service.domain.machine import machine_doc, machine_from_doc
 from abbe.service.domain.progress import Progress, ignore_progress
 from abbe.service.errors import MeasurementFault, StillActive, TableMismatch, TableRefused
 from abbe.service.push.execute import semantic_digest_of_tables
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.recipes.campaigns import identification, verification
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import table_image
 from tests.pretended import as_if_commissioned

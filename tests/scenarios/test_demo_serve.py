@@ -130,7 +130,7 @@ def test_the_machine_file_of_the_demonstration_is_one(tmp_path: Path) -> None:
     from abbe.service.config import load_machine
     from abbe.service.demo.demo import demo_site, write_machine_file
     from abbe.service.demo.simulator_process import SimulatorProcess
-    from abbe.service.site import machine_from_doc
+    from abbe.service.domain.machine import machine_from_doc
 
     doc = {
         "chain": "w-X-Y-b-Z-t", "tool_mm": [0.0, 0.0, -120.0], "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]},

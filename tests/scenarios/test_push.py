@@ -20,6 +20,7 @@ from abbe.service.compensation import pushing
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
 from abbe.service.compensation.recover import accept, recover
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.machine import machine_doc, machine_from_doc
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.domain.push_entry import PushState
 from abbe.service.errors import MeasurementFault, PushNotBegun, StillActive, StoreError, TableMismatch, TableRefused, UnsafeToMove
@@ -28,7 +29,7 @@ from abbe.service.push.operations import VerificationResult
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base, table_image
 from tests.pretended import as_if_commissioned

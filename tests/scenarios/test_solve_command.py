@@ -10,11 +10,11 @@ import pytest
 
 from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.service.campaign_data.campaign_folder import from_folder
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.solution_file import SolutionFile, StoredPrediction
 from abbe.service.identification import solve_report
 from abbe.service.identification.solve import solve_runs
 from abbe.service.runs.exchange import import_folder
-from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from tests.experiments.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, thinned, write_folder

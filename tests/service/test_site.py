@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from abbe.service.site import machine_from_doc
+from abbe.service.domain.machine import machine_from_doc
 
 DOC = {"name": "m", "chain": "w-X-Y-b-Z-t", "stroke_mm": {"X": [0, 600], "Y": [0, 500], "Z": [0, 450]}}
 

@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
-from abbe.service.site import machine_from_doc
 from abbe.simulators.__main__ import main
 from abbe.simulators.hidden.cases import Case, make_case
 from abbe.simulators.hidden.draws import KINDS

@@ -21,6 +21,7 @@ from abbe.service.config_schema import Web
 from abbe.service.core.push_recovery import recover_at_start
 from abbe.service.core.setup import ServiceSetup
 from abbe.service.devices.session import DeviceUrls, Session, lock_machine, open_session
+from abbe.service.domain.machine import machine_doc, machine_from_doc
 from abbe.service.domain.progress import JobOutcome, Progress
 from abbe.service.domain.schedule import Schedule
 from abbe.service.logs import configure_logs
@@ -30,7 +31,7 @@ from abbe.service.scheduler import alarm_manager
 from abbe.service.sequences.recipes.recipe import Diagonal
 from abbe.service.sequences.steps import CampaignPlan
 from abbe.service.serve import serve
-from abbe.service.site import Site, machine_doc, machine_from_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import read_base
 from tests.scenarios.test_push import linear_tables

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from abbe.models.machine import AXES, Machine
 from abbe.service.channel.messages import MachineSummary
-from abbe.service.domain.machine import Rules
+from abbe.service.domain.machine import Rules, machine_from_doc
 from abbe.service.errors import AbbeError
 from abbe.service.rendering.numbers import MM, Unit
 from abbe.service.report.dry_run_page import picture
@@ -21,7 +21,6 @@ from abbe.service.sequences.recipes.campaigns import (
     split_recipe_name,
 )
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MountLaser, TestPlan
-from abbe.service.site import machine_from_doc
 
 CAMPAIGN = IDENTIFICATION
 """The full campaign, whose prompts guide a person through the set-ups."""

@@ -12,7 +12,7 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.volume import unit_deviation, volume_frame, volume_grid
 from abbe.models.machine import Machine
 from abbe.service.domain.document import Doc
-from abbe.service.domain.machine import Rules
+from abbe.service.domain.machine import Rules, machine_from_doc
 from abbe.service.domain.results import SolutionRecord
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction, stored_solution
 from abbe.service.errors import AbbeError
@@ -24,7 +24,6 @@ from abbe.service.rendering.numbers import plain, with_uncertainty
 from abbe.service.rendering.plots.bars import contribution_bars
 from abbe.service.report.report_discovery import DECIDED, discovery_report
 from abbe.service.report.report_measured import SOLUTION_SIGNS
-from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from abbe.service.web.frame import current
 

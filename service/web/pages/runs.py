@@ -9,7 +9,7 @@ from typing import Any
 from markupsafe import Markup
 
 from abbe.service.campaign_data.campaign_folder import Campaign
-from abbe.service.domain.machine import DeviceUrls, Rules
+from abbe.service.domain.machine import DeviceUrls, Rules, machine_from_doc
 from abbe.service.domain.measured import RunRecord
 from abbe.service.domain.run import Run
 from abbe.service.errors import AbbeError
@@ -23,7 +23,7 @@ from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.report.report_measured import Measured, run_report
 from abbe.service.runs.columns import load_run
 from abbe.service.runs.observations import run_data, with_earliest_mounting
-from abbe.service.site import Site, machine_from_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.verification.compare_runs import (
     MOST,

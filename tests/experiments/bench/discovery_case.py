@@ -9,9 +9,9 @@ from itertools import cycle, islice
 from pathlib import Path
 
 from abbe.models.discovery.case import Case
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
-from abbe.service.site import machine_from_doc
 from abbe.simulators.hidden import plans
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import write_case

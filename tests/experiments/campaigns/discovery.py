@@ -20,9 +20,9 @@ from abbe.models.discovery.discover import discover
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.finding import finding_of
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
-from abbe.service.site import machine_from_doc
 
 
 def answered(folder: Path, out: Path) -> tuple[str, float]:

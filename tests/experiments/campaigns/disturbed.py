@@ -33,13 +33,14 @@ from abbe.service.campaigns.measure import MeasureOptions, measure
 from abbe.service.campaigns.resume import resume
 from abbe.service.compensation.recover import recover
 from abbe.service.devices.session import DeviceUrls, open_session
+from abbe.service.domain.machine import machine_doc
 from abbe.service.errors import AbbeError, Interlock
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.runs.columns import load_run
 from abbe.service.sequences.control import Control, State, Suspending, Watching
 from abbe.service.sequences.recipes.recipe_file import parse_recipe
 from abbe.service.sequences.steps import CampaignPlan
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.simulators.faults.modbus_proxy import ModbusProxy
 from abbe.simulators.faults.scenario import Fault, FaultScenario

@@ -19,9 +19,9 @@ from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.discover import discover
 from abbe.models.effects.catalogue import CATALOGUE
 from abbe.models.effects.path import Path
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.errors import MeasurementFault
 from abbe.service.runs.cases import case_of
-from abbe.service.site import machine_from_doc
 from abbe.simulators.hidden.cases import make_case
 from abbe.simulators.hidden.suite import campaign, run_file
 from tests.models.discovery.discovery_frames import later, renamed, turned_machine, turned_run

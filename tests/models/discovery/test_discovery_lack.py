@@ -13,9 +13,9 @@ from abbe.models.discovery.lack import floors, repeat_steps
 from abbe.models.discovery.whitened_problem import whiten
 from abbe.service.discovery.discovery_answer import answer_doc
 from abbe.service.discovery.discovery_text import verdict_of
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.runs.cases import case_of
 from abbe.service.runs.exchange import read_folder
-from abbe.service.site import machine_from_doc
 from tests.service.discovery.axis_bench import axis_case, found_in, searched, with_repeats
 
 BIFROST = (

@@ -9,12 +9,13 @@ from abbe.models.paths import DIAGONALS
 from abbe.models.solvers.observations import RunData
 from abbe.service.cli.results.solve_text import print_solution, summary_lines
 from abbe.service.devices.session import DeviceUrls
+from abbe.service.domain.machine import machine_doc
 from abbe.service.domain.solution_file import SolutionFile
 from abbe.service.errors import InstrumentsDisagree
 from abbe.service.identification.solve import Solved, solve_runs
 from abbe.service.identification.solve_report import assess, solution_doc
 from abbe.service.report.solution_sections import parameter_rows
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from tests.models.solvers.truth import MACHINE, Truth
 from tests.run_documents import runs_of
 

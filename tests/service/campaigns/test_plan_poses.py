@@ -10,10 +10,11 @@ import pytest
 from abbe.service.campaigns.plan_poses import TILT_DEG, _offered, plan_poses, pose_doc, pose_rows, read_artefact
 from abbe.service.devices.session import DeviceUrls
 from abbe.service.domain.artefact import ArtefactObject
+from abbe.service.domain.machine import machine_doc
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run
 from abbe.service.sequences.recipes.recipe_file import parse_recipe
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 from tests.faults.sequencer_world import MACHINE
 
 SITE = Site("sim", MACHINE, machine_doc("sim", MACHINE), DeviceUrls())

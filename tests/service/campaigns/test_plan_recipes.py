@@ -15,13 +15,14 @@ from abbe.models.planning.plan import PlanStep
 from abbe.service.campaigns.plan import describe, plan_for, plan_report, read_instruments, recipe_of
 from abbe.service.cli.app import app
 from abbe.service.devices.session import DeviceUrls
+from abbe.service.domain.machine import machine_doc
 from abbe.service.errors import AbbeError, ConfigError
 from abbe.service.rendering.document_page import document_html
 from abbe.service.sequences.check import dry_run, dry_run_campaign
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from abbe.service.sequences.recipes.recipe_file import parse_recipe, read_recipe, recipe_text, shared_setups
 from abbe.service.sequences.steps import CampaignPlan, ChangeBar, MountBar, MountLaser, MoveTo, RecordPath, TakeBarOut, Unmount
-from abbe.service.site import Site, machine_doc
+from abbe.service.site import Site
 
 MACHINE = Machine("w-X-Y-b-Z-t", np.array([[0.0, 600.0], [0.0, 500.0], [0.0, 450.0]]))
 ONE_BAR = Instruments(bar_lengths_mm=(150.0,))

@@ -11,10 +11,10 @@ from abbe.models.discovery.case import Case
 from abbe.service.discovery.discover import search
 from abbe.service.discovery.finding import finding_of
 from abbe.service.domain.finding import Finding
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.progress import ignore_progress
 from abbe.service.effects.effect_catalogue import catalogue
 from abbe.service.runs.cases import case_of
-from abbe.service.site import machine_from_doc
 from tests.run_documents import runs_of
 
 Doc = dict[str, Any]

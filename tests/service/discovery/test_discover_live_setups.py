@@ -12,11 +12,11 @@ from abbe.models.discovery.answer import Localization
 from abbe.service.campaign_data.campaign_folder import Campaign, ensure_stored, from_folder
 from abbe.service.discovery.discover_live import LiveAddition, find_addition
 from abbe.service.discovery.experiment_recipes import next_plan
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.measured import Owner
 from abbe.service.runs.cases import case_of
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import CampaignPlan, MountBar, MoveTo, RecordPath, TestPlan, Unmount
-from abbe.service.site import machine_from_doc
 from abbe.service.storage.store import Store
 from tests.run_documents import run_of
 from tests.service.discovery.discovery_bench import MACHINE, Doc, write_case

@@ -9,10 +9,10 @@ from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.experiment.additions import REPEAT_LATE_S
 from abbe.service.discovery.effect_pages import ADDS
 from abbe.service.discovery.experiment_recipes import MAKERS, NO_HELIX, NO_PATH, TURNED, NextPlan, next_plan
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.run import BarSetup
 from abbe.service.sequences.recipes.recipe import Helix
 from abbe.service.sequences.steps import MountBar, MoveTo, RecordPath, Unmount
-from abbe.service.site import machine_from_doc
 from tests.run_documents import run_of, runs_of
 from tests.service.discovery.discovery_bench import MACHINE, Doc
 

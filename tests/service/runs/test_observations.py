@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.runs.cases import path_of
 from abbe.service.runs.observations import run_data, with_reversals
-from abbe.service.site import machine_from_doc
 from tests.run_documents import run_of
 from tests.service.discovery.axis_bench import MACHINE, axis_run, cycles, with_repeats
 

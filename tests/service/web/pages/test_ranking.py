@@ -11,8 +11,8 @@ from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import Machine
 from abbe.service.domain.document import Doc
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.solution_file import MotionValue, SolutionFile, StoredPrediction
-from abbe.service.site import machine_from_doc
 from abbe.service.web.pages.results import NODES, Ranked, ranking
 from tests.pages_world import solved_campaign
 

@@ -11,11 +11,10 @@ from fastapi import FastAPI
 
 from abbe.service.channel.messages import MachineSummary
 from abbe.service.clock import SystemClock
-from abbe.service.domain.machine import MachineObject, Rules
+from abbe.service.domain.machine import MachineObject, Rules, machine_from_doc
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.check import dry_run_campaign
 from abbe.service.sequences.recipes.campaigns import RATES_HZ, named, recipe_plan, split_recipe_name
-from abbe.service.site import machine_from_doc
 from abbe.service.web.core_link.core_line import CoreLine
 from abbe.service.web.jobs import add_jobs
 from abbe.service.web.page import HERE, environment

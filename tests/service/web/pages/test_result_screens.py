@@ -13,10 +13,9 @@ from scipy.stats import chi2
 from abbe.models.functions.motions import motion_names
 from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.models.verification import U_REPEAT_MM
-from abbe.service.domain.machine import Rules
+from abbe.service.domain.machine import Rules, machine_from_doc
 from abbe.service.domain.solution_file import StoredPrediction
 from abbe.service.runs.observations import run_data
-from abbe.service.site import machine_from_doc
 from abbe.service.verification.compare_runs import LoadedRun, RunDifference, curve, difference, remarks
 from abbe.service.web.api.results import Motion
 from abbe.service.web.pages.runs import run_document

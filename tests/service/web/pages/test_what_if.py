@@ -28,8 +28,8 @@ from abbe.models.uncertainty.what_if import (
 )
 from abbe.models.verification import diagonal_figure
 from abbe.models.verification import helix_figure as measured_helix
+from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.solution_file import StoredPrediction
-from abbe.service.site import machine_from_doc
 from tests.pages_world import solved_campaign
 
 
