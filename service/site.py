@@ -9,7 +9,7 @@ from typing import Any
 
 from abbe.models.machine import Machine
 from abbe.service.config_schema import MachineFile
-from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, control_of, machine_from_doc
+from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, machine_from_doc
 from abbe.service.domain.machine_file import CaptureSettings
 from abbe.service.errors import TableRefused
 from abbe.service.push.validate import PushLimits
@@ -41,11 +41,6 @@ class Site:
     two_people: bool = False
     materials: Mapping[str, AxisMaterial] = field(default_factory=dict)
     room_c: tuple[float, float] | None = None
-
-    @property
-    def control(self) -> str:
-        """Identity of the control, as its journal of tables names it; empty without a control."""
-        return control_of(self.urls.cnc)
 
 
 def site_of(config: MachineFile) -> Site:

@@ -354,7 +354,7 @@ def warn_of_open_push(url: str, site: Site) -> None:
     except StoreError:  # no database yet: there is no journal
         return
     with store:
-        warnings = open_pushes(store, site.name, site.control)
+        warnings = open_pushes(store, site.name, site.urls.control)
     for line in warnings:
         typer.echo(f"warning: {line}", err=True)
 

@@ -305,7 +305,7 @@ def keep_proof(store: Store, site: Site, doc: Doc) -> int:
 
 def _earlier_boots(store: Store, site: Site) -> set[int]:
     """Boot ids of earlier pushes and commissionings of this machine."""
-    boots = {push.boot for push in JournalView.read(store, site.name, site.control, origins=False).bases()}
+    boots = {push.boot for push in JournalView.read(store, site.name, site.urls.control, origins=False).bases()}
     last = last_proof(store, site)
     return boots | ({int(last["boot_id"])} if last else set())
 

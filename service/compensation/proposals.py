@@ -130,7 +130,7 @@ async def candidate_context(
     site: Site, store: Store, base: Base, form: TableFormat, grid: NineTables, clock: Clock, *, attended: bool = True
 ) -> CandidateContext:
     """The present state of this machine, its controller and its table in force. ``attended``: an authorised approver is at the machine."""
-    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)
+    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.urls.control, origins=False)
     month_ago = {} if attended else _on_grid(_month_ago(journal, base, clock), grid)
     travel = {axis: (float(low), float(high)) for axis, (low, high) in zip(AXES, site.machine.stroke_mm, strict=True)}
     return CandidateContext(

@@ -154,7 +154,7 @@ class Pushing:
         self.control.no_pause_reason = "an unverified table may be in force: stop the push, or let it finish"
         try:
             await self.control.gate()
-            book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.control)
+            book = await StoreBook.new(self.store, self.site.name, self.clock, self.site.urls.control)
             await self._wait_for_standstill()
             ended = await self._drive(book, order, wanted, questions)
             await self._look_again(ended)
@@ -175,7 +175,7 @@ class Pushing:
         return OperationOrder(
             self.site.name, image, crc32(image), semantic_digest, self.site.limits.digest(),
             owner=(secrets.randbits(15) + 1) << 16, level=level, attended=self.attended, table=table_id,
-            process=asdict(this_process()), control=self.site.control,
+            process=asdict(this_process()), control=self.site.urls.control,
         )  # fmt: skip
 
     async def _wait_for_standstill(self) -> None:
@@ -363,4 +363,4 @@ def pushes_here(store: Store, site: Site) -> bool:
 
 
 def _control_key(store: Store, site: Site) -> tuple[str, str]:
-    return str(store.url), site.control or site.name
+    return str(store.url), site.urls.control or site.name

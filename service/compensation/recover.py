@@ -94,7 +94,7 @@ async def finish_push(
 
 async def _finish_last(controller: TableController, store: Store, site: Site, clock: Clock) -> str | None:
     """Finish the last push without checking the table in force; return what was done."""
-    book = await StoreBook.last(store, site.name, clock, site.control)
+    book = await StoreBook.last(store, site.name, clock, site.urls.control)
     journal: Journal = () if book is None else await book.entries()
     if book is None or journal[-1].push == NO_PUSH:
         return None
@@ -136,7 +136,7 @@ async def accept(controller: TableController, store: Store, site: Site, by: str 
     """
     clock = SystemClock()
     await store.write(store.machines.add, site.name, site.doc)
-    book = await StoreBook.last(store, site.name, clock, site.control)
+    book = await StoreBook.last(store, site.name, clock, site.urls.control)
     journal: Journal = () if book is None else await book.entries()
     if book is not None and journal[-1].state not in TERMINAL and await is_own(controller, site, journal):
         _refuse_if_under_way(store, site, journal)
@@ -163,7 +163,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
             "remove the laid-aside table at the control first; nothing was accepted",
         )
     known = await asyncio.to_thread(known_tables, store)
-    chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
+    chain = await asyncio.to_thread(store.pushes.chain, site.name, site.urls.control)
     await _hand_to_person(store, site, chain)
     for other_chain in _open_with(crc, known) - {chain}:
         book = await _hand_to_person(store, site, other_chain)
@@ -186,7 +186,7 @@ def _open_with(crc: int, known: KnownTables) -> set[str]:
 async def _hand_to_person(store: Store, site: Site, chain: str) -> StoreBook:
     """Close the last push of a journal, if it is open, so that a person can decide; return the journal."""
     book = await StoreBook.of_chain(store, chain, SystemClock()) or await StoreBook.for_acceptance(
-        store, site.name, SystemClock(), site.control
+        store, site.name, SystemClock(), site.urls.control
     )
     journal = await book.entries()
     if journal and journal[-1].state not in TERMINAL:
@@ -215,7 +215,7 @@ async def is_own(controller: Identity, site: Site, journal: Journal) -> bool:
     state hold the same one. The controller is read only where address and name do not match.
     """
     known = facts(journal)
-    here = _address(journal) in ("", site.control)
+    here = _address(journal) in ("", site.urls.control)
     if here and _name(journal, site) == site.name:
         return True
     now = await controller.comp_status()
@@ -321,7 +321,7 @@ async def finish_when_safe(
     TableMismatch
         The controller holds a table that is not in the journal: a person must look.
     """
-    book = await StoreBook.last(store, site.name, clock, site.control)
+    book = await StoreBook.last(store, site.name, clock, site.urls.control)
     if book is None or (await book.entries())[-1].state in TERMINAL - {PushState.OPERATOR}:
         return None
     port = ControllerPort(controller, no_actors(), clock)

@@ -90,7 +90,7 @@ async def rollback(
         From `Pushing.bring`.
     """
     await recover(controller, store, site)
-    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.control)
+    journal = await asyncio.to_thread(JournalView.read, store, site.name, site.urls.control)
     if not journal.entries:
         raise TableRefused("no push of this machine is in the journal: there is nothing to roll back", "nothing was written")
     base = await read_base(controller)
@@ -211,7 +211,7 @@ async def ordered_rollback(site: Site, store: Store, order: RollbackOrder, *, cl
 async def _attempt(controller: TableController, store: Store, site: Site, order: RollbackOrder, clock: Clock) -> JobOutcome:
     control = order.request.control
     try:
-        await asyncio.to_thread(check_unchanged, store, site.name, order, site.control)
+        await asyncio.to_thread(check_unchanged, store, site.name, order, site.urls.control)
         back = await rollback(controller, store, site, request=order.request)
     except (TableRefused, TableMismatch) as no:
         return JobOutcome("refused", with_notes(no))

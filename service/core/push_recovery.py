@@ -137,7 +137,7 @@ async def recover_at_start(store: Store, site: Site) -> str | None:
     """
     runs = await asyncio.to_thread(recover_segments, store, site.capture)
     done = [run.text for run in runs]
-    if await push_is_open(store, site.name, site.control):
+    if await push_is_open(store, site.name, site.urls.control):
         with lock_machine(site.urls.cnc):
             async with recovered_session(store, site, DeviceUrls(cnc=site.urls.cnc), report=done.append):
                 pass

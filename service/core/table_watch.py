@@ -67,10 +67,10 @@ def look_at_table(site: Site, store: Store) -> LookAtTable:
             pass  # released at once: reading must not block a measurement
         async with open_session(DeviceUrls(cnc=site.urls.cnc)) as session:
             known = await asyncio.to_thread(known_tables, store)
-            chain = await asyncio.to_thread(store.pushes.chain, site.name, site.control)
+            chain = await asyncio.to_thread(store.pushes.chain, site.name, site.urls.control)
             now = await _look_or_strange(session.controller, known, chain, corrects)
         # Read the journal after the controller: a push that ended in between is then already in the journal.
-        wanted, settled = (await asyncio.to_thread(JournalView.read, store, site.name, site.control, origins=False)).wanted
+        wanted, settled = (await asyncio.to_thread(JournalView.read, store, site.name, site.urls.control, origins=False)).wanted
         push = now.unverified
         whose = "" if push is None else f"push {push.push} of machine {push.machine!r}"
         return InForce(now.status.active_bank, now.crc, wanted, settled, whose, now.strange or now.elsewhere is not None)

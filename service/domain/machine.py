@@ -5,7 +5,7 @@ Nothing here connects to a device.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from datetime import date
 from typing import TYPE_CHECKING, Annotated, Any, Literal, Self
 from urllib.parse import parse_qs, urlsplit
@@ -109,16 +109,20 @@ UNIT = "1"
 
 @dataclass(frozen=True, slots=True)
 class DeviceUrls:
-    """Device URLs of a machine; None: not connected."""
+    """Device URLs of a machine; None: not connected. ``control``: identity of the control (`control_of`); empty without a control."""
 
     cnc: str | None = None
     ballbar: str | None = None
     laser: str | None = None
     fixture: str | None = None
+    control: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "control", control_of(self.cnc))
 
     def named(self) -> tuple[str, ...]:
         """Roles that have an address."""
-        return tuple(role for role, url in asdict(self).items() if url is not None)
+        return tuple(role for role in ("cnc", "ballbar", "laser", "fixture") if getattr(self, role) is not None)
 
 
 def control_of(url: str | None) -> str:

@@ -105,13 +105,13 @@ async def check_in_force(controller: TableController, store: Store, site: Site) 
 
 
 def _journals(store: Store, site: Site) -> tuple[KnownTables, str]:
-    return known_tables(store), store.pushes.chain(site.name, site.control)
+    return known_tables(store), store.pushes.chain(site.name, site.urls.control)
 
 
 def _whose(store: Store, site: Site, push: PushedTable) -> str:
-    if push.chain == store.pushes.chain(site.name, site.control) and push.machine == site.name:
+    if push.chain == store.pushes.chain(site.name, site.urls.control) and push.machine == site.name:
         return f"push {push.push}"
-    at = f" at {push.control}" if push.control and push.control != site.control else ""
+    at = f" at {push.control}" if push.control and push.control != site.urls.control else ""
     return f"push {push.push} of machine {push.machine!r}{at}"
 
 
@@ -136,10 +136,10 @@ async def accept_strange(controller: TableController, store: Store, site: Site, 
 
 async def vouch(store: Store, site: Site, now: CompStatus, by: str) -> None:
     """Record in the journal of the control that a person accepts the table in force. The last push must have ended."""
-    book = await StoreBook.for_acceptance(store, site.name, SystemClock(), site.control)
+    book = await StoreBook.for_acceptance(store, site.name, SystemClock(), site.urls.control)
     journal = await book.entries()
     await book.append(
-        journal, PushState.ACCEPTED, acceptance_doc(now, by) | ({} if journal else {"machine": site.name, "control": site.control})
+        journal, PushState.ACCEPTED, acceptance_doc(now, by) | ({} if journal else {"machine": site.name, "control": site.urls.control})
     )
 
 

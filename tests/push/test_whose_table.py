@@ -234,7 +234,7 @@ async def test_under_a_new_name_of_the_same_control_the_table_is_taken_back_firs
 
 async def test_at_another_address_it_is_refused_and_a_person_s_word_closes_it_under_every_name(tmp_path: Path) -> None:
     async with left_in_probation(tmp_path) as left:
-        controller, here = left.b.session.controller, left.b.site.control
+        controller, here = left.b.session.controller, left.b.site.urls.control
         elsewhere = left.site("mill-A", left.b.site.urls.cnc.replace("127.0.0.1", "localhost"))
         words = rf"is that of push 1 of machine 'sim' at {re.escape(here)}, which was never verified.*machine file of 'sim'"
         with pytest.raises(TableMismatch, match=words):
@@ -280,7 +280,7 @@ async def test_a_control_of_the_same_name_at_another_address_does_not_end_the_op
         now, before = await other.session.controller.comp_status(), left.store.pushes.entries("sim")
         assert (now.bank_crc[now.active_bank], other.site.name) == (left.base, left.b.site.name)
         for _ in range(2):
-            with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(left.b.site.control))):
+            with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(left.b.site.urls.control))):
                 await recover(other.session.controller, left.store, other.site)
         assert left.store.pushes.entries("sim") == before  # nothing was written
         assert await other.session.controller.comp_status() == now
@@ -323,7 +323,7 @@ async def test_two_machines_of_two_names_do_not_meet_each_other_s_open_push(tmp_
         site = replace(other.site, name="lathe")
         assert await recover(other.session.controller, left.store, site) is None
         assert left.store.pushes.entries("sim")[-1].state == PushState.PROBATION
-        assert left.store.pushes.entries("lathe", site.control) == []
+        assert left.store.pushes.entries("lathe", site.urls.control) == []
 
 
 async def test_an_open_push_at_an_address_where_another_control_is_now_waits_for_a_person(tmp_path: Path) -> None:
@@ -338,7 +338,7 @@ async def test_an_open_push_at_an_address_where_another_control_is_now_waits_for
                 if end is not None:
                     await recover(controller, later.store, end)  # as the control came: the old table is in force, too
                 now = await controller.comp_status()
-                with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(site.control))):
+                with pytest.raises(TableMismatch, match=NOT_HERE.format(re.escape(site.urls.control))):
                     await recover(controller, store, site)
                 assert await controller.comp_status() == now
                 assert store.pushes.entries("sim")[-1].state == PushState.PROBATION
@@ -376,7 +376,7 @@ async def test_a_table_that_this_database_did_not_push_is_refused_until_a_person
             assert table_remarks(store, "lathe", used).remarks == (
                 f"measured with a table (CRC {crc}) that was accepted on machine 'sim', not on this one: not accepted",
             )
-            assert (await StoreBook.new(store, "sim", SystemClock(), site.control))._push == 1  # a word is not a push
+            assert (await StoreBook.new(store, "sim", SystemClock(), site.urls.control))._push == 1  # a word is not a push
 
 
 async def test_a_table_verified_on_one_control_is_not_good_on_another_until_a_person_s_word(tmp_path: Path) -> None:
@@ -387,7 +387,7 @@ async def test_a_table_verified_on_one_control_is_not_good_on_another_until_a_pe
             for _ in range(2):
                 with pytest.raises(TableMismatch, match=r"was verified on machine 'A' \(push 1\), not on this one"):
                     await recover(controller, store, site)
-            assert store.pushes.entries(site.name, site.control) == []
+            assert store.pushes.entries(site.name, site.urls.control) == []
             told = await recover(controller, store, site, accept_by="ann")
             assert "verified on machine 'A' (push 1), not on this one (CRC" in str(told)
             assert await recover(controller, store, site) is None

@@ -104,7 +104,7 @@ def rollback(
     site = site_of(loaded.machine)
 
     async def work(store: Store) -> RollbackResult | str | None:
-        last = store.pushes.entries(site.name, site.control)[-1:]
+        last = store.pushes.entries(site.name, site.urls.control)[-1:]
         finished = bool(last) and last[0].state not in TERMINAL
         if not (finished and to is None) and not yes and not await _confirmed(to):
             raise ConfigError("nothing was rolled back", "answer yes, or add --yes if no one is at the console")
