@@ -315,5 +315,5 @@ def test_without_a_run_that_judges_the_gap_is_told_on_left_out_blocks_and_such_a
     assert found.next_test is not None
     assert found.next_test.adds == ("judging_run",)
     told = lines_of(finding_of(found, alone, FEW, {r.path.label: np.zeros(r.path.n) for r in alone.runs}))
-    assert "no holdout run of this campaign can judge; on blocks of runs, each left out of the fit once" in told[0]
+    assert "no holdout run of this campaign can judge; on blocks of runs left out of the fit in turn" in told[0]
     assert any("measure next: a run of the role holdout" in line for line in told)
