@@ -214,7 +214,7 @@ def _shows_noise(run: Run) -> bool:
 
 
 LARGEST_MM = 2.0
-"""Largest plausible deviation: many larger numbers are in another unit, single ones are outliers."""
+"""Largest plausible deviation: if many are larger, the unit is wrong; single larger ones are outliers."""
 NO_READING_MM = 1000.0
 """No instrument can read a deviation this large, not even as a spike."""
 SPIKES = 0.05
@@ -244,7 +244,7 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
     Raises
     ------
     CampaignRefused
-        The message states the first such issue, and names the runs with further ones.
+        The message states the first such issue, and names the runs with further issues.
     """
     bad = [f for f in issues if f.refuse]
     if bad:

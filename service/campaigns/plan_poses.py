@@ -47,7 +47,7 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class PlannedPose:
-    """A pose in order: its recipe and dry run, minutes with mounting, and the uncertainty after it."""
+    """A chosen pose: its recipe and dry run, minutes with mounting, and the uncertainty after it."""
 
     recipe: ArtefactTest
     dry: DryRun

@@ -352,7 +352,7 @@ class Scan:
     tail_bytes : int
         Number of these later bytes.
     broken_links : list of int
-        Indices of records whose ``previous`` is not the hash of the record before: one was removed, inserted or changed.
+        Indices of records whose ``previous`` is not the hash of the record before: a record was removed, inserted or changed.
     head : bytes
         SHA-256 of the last good record.
     """

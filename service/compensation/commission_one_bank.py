@@ -69,7 +69,7 @@ async def _try(t: Trial, control: OneBank) -> None:
     t.expect_refusal(FLAG, await t.refusal_of(control.write_table(part, first=0)), "a write while the table acts")
     t.expect_refusal(FLAG, await t.refusal_of(control.switch(on=False, expect_crc=crc ^ 1)), "to switch off with another CRC")
     if not (await control.table_state()).acts:
-        t.fail(FLAG, "it is switched off after a refusal")
+        t.fail(FLAG, "the table is off although the request was refused")
         return
     await control.switch(on=False, expect_crc=crc)
     t.judge(FLAG, not (await control.table_state()).acts, "says that it is off", "does not say that it is off")

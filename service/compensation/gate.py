@@ -94,9 +94,9 @@ class PushPrecheck:
     def _bound(self) -> Iterator[str]:
         p, now = self.proposed, self.base
         if p.machine != self.site.doc:
-            yield "MACHINE: the machine file differs from the one at the proposal (name, chain, strokes, pivots or tool)"
+            yield "MACHINE: the machine file has changed since the proposal (name, chain, strokes, pivots or tool)"
         if now.crc == p.candidate.base_crc and now.image != p.base.image:
-            yield "BASE: the table in force has the same CRC as the one at the proposal, but other content"
+            yield "BASE: the table in force has the CRC of the table at the proposal, but other content"
         if now.status.boot_id != p.base.boot:
             boots = f"boot {p.base.boot:08X} then, {now.status.boot_id:08X} now"
             yield f"RESTART: the controller restarted since the proposal ({boots}): measure again"
@@ -105,7 +105,8 @@ class PushPrecheck:
         if not set(p.candidate.evidence.calibrated_until_s) <= {until_s(day) for day in self.site.calibrated_until.values()}:
             yield "CERTIFICATE: the certificates in the machine file have changed since the proposal: propose again"
         if self.site.limits != p.limits:
-            yield f"LIMITS: they have changed since the proposal ({_changed(asdict(p.limits), asdict(self.site.limits))}): propose again"
+            changes = _changed(asdict(p.limits), asdict(self.site.limits))
+            yield f"LIMITS: the limits have changed since the proposal ({changes}): propose again"
 
     def _rejected(self) -> Iterator[str]:
         for row in self.rejections[-1:]:

@@ -19,7 +19,7 @@ from abbe.service.storage.store import Store
 KIND = "levels"
 HINT = "this controller's capabilities for a safe push were never proved{}: run abbe comp commission; until then a person has to attend"
 ONE_TABLE = (
-    "this control has one table, so it can have the lower push level only, and that was never commissioned{}: "
+    "this control has one table, so it can have the lower push level only, and this level was never commissioned{}: "
     "abbe comp commission --one-bank; until then nothing is written into the control"
 )
 

@@ -247,7 +247,7 @@ class Pushing:
         async def validate(journal: Journal) -> list[str]:
             known = facts(journal)
             if known.base_crc != wanted.base.crc or known.base_image != wanted.base.image:
-                return ["BASE: the active table is not the one that this table was made for"]
+                return ["BASE: this table was made for another active table"]
             if (known.boot, known.gen) != (wanted.base.status.boot_id, wanted.base.status.gen):
                 return ["GENERATION: the controller restarted, or a bank was changed, since the base was read"]
             return questions.validate()

@@ -178,7 +178,7 @@ def table_before_last_kept(journal: JournalView, base: Base) -> KnownTable:
     f, number = facts(last), last[-1].push
     if f.image != base.image:
         raise TableRefused(
-            f"the table in force is not the one of push {number}", "name the push to go back to with --to PUSH; nothing was written"
+            f"the table in force is not the table of push {number}", "name the push to go back to with --to PUSH; nothing was written"
         )
     return _base(last, f"the table that was in force before push {number}")
 
@@ -228,7 +228,7 @@ async def _attempt(controller: TableController, store: Store, site: Site, order:
 
 
 def check_unchanged(store: Store, machine: str, order: RollbackOrder, control: str = "") -> None:
-    """Refuse an order if the table that it replaces is not the one in force by the journal.
+    """Refuse an order if, by the journal, the table that it replaces is not in force.
 
     Raises
     ------

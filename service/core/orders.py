@@ -53,7 +53,7 @@ class CampaignOrder:
     """A full campaign that a person started: its recipe, the proposer, the sink for progress, and the control that pauses and stops it.
 
     ``cause``: the alarm whose cause the campaign looks for, and the function that writes the alarm's lines; None: no alarm. ``resume``:
-    the interrupted campaign that it completes; empty: a new one.
+    the interrupted campaign that this one completes; empty: a new one.
     """
 
     recipe: str

@@ -39,7 +39,7 @@ class ArtefactFinding:
     def verdict(self) -> str:
         """Verdict: errors that move with the part, errors of the machine, and errors that these poses do not separate."""
         if self.rank is None:
-            return "unknown: named fields are separated for one plate in a plane only; the solution separates part and machine by points"
+            return "unknown: only one plate in one plane gives errors a name; the solution separates part and machine point by point"
         said = [
             f"{where}: {', '.join(found)}"
             for where, words in (

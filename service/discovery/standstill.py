@@ -121,7 +121,7 @@ def lines_of(answer: StandstillAnswer) -> list[str]:
 
 def _shift_lines(answer: StandstillAnswer) -> list[str]:
     better = "look for what changed there (coolant, mounting, sensor)"
-    worse = "this model predicts worse than the other; runs that begin warmer or colder than the rest look the same in it"
+    worse = "the other model predicts better; in this one, runs that begin warmer or colder than the rest also look like a shift"
     found = (
         (answer.found.shift_absolute, "temperatures as they are", worse if answer.found.since_start else better),
         (answer.found.shift_since_start, "changes of temperature", better if answer.found.since_start else worse),

@@ -226,10 +226,10 @@ class MotionChange:
 class ChangedSince:
     """Changes of the machine since an earlier solution.
 
-    ``gap``, ``judged``: None if too few set-ups judge. ``judged``: natural logarithm of the likelihood ratio, with to without the changes,
-    of runs that were not used to find them. ``hidden_um_m``: possible undetected change of each scale and squareness. ``beside``: effects
-    found in the same runs that may have the same cause. ``proved``: whether runs that were not used to find the changes confirm them.
-    ``trouble``: why nothing could be compared.
+    ``gap``, ``judged``: None if too few set-ups judge. ``judged``: natural logarithm of the factor by which the changes raise the
+    likelihood of runs that were not used to find them. ``hidden_um_m``: possible undetected change of each scale and squareness.
+    ``beside``: effects found in the same runs that may have the same cause. ``proved``: whether runs that were not used to find the changes
+    confirm them. ``trouble``: why nothing could be compared.
     """
 
     since: int
@@ -255,7 +255,8 @@ class Finding:
     proved, proof : whether runs that were never fitted confirm the names, and by which rule.
     location : where the gap of the present model shows (tests, axes, places, times).
     rejected : labels that were tried, and the reason against each.
-    confounded_with : rivals of the named effects whose evidence is too close to exclude them. beside : unnamed structures beside them.
+    confounded_with : rivals that the evidence does not exclude.
+    beside : unnamed structures beside the named effects.
     agreement : how runs that were never fitted agree with their prediction, if nothing is missing.
     unjudged, unseen : runs that cannot be judged, and blind spots, if nothing is missing.
     fitted : parameters of the present simulation that these runs measure.

@@ -89,7 +89,7 @@ class Schedule:
     first: Annotated[AwareDatetime, Field(description="a moment from which every_h is counted, e.g. 2026-11-02T06:00:00+01:00")] = FIRST_UTC
     catch_up: Annotated[
         Literal["skip", "once"],
-        Field(description="missed slots: skip: recorded, the machine is not moved; once: recorded, and one run for all of them"),
+        Field(description="missed slots are recorded; skip: nothing runs for them; once: one run for all of them"),
     ] = "skip"
     needs: Needs = Needs()
     on_alarm: Annotated[

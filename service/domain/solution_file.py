@@ -158,8 +158,8 @@ class WorstPoint(FileObject):
 class BudgetLineValue(FileObject):
     """One source of uncertainty, rms over the volume, and its share of the variance.
 
-    ``type``: how its size was found, A from readings, B stated or assumed (GUM 4.2, 4.3); ``dof``: its degrees of freedom, null where it
-    was stated. Both are absent in solutions of earlier versions.
+    ``type``: how its size was found, A from readings, B stated or assumed (GUM 4.2, 4.3); ``dof``: its degrees of freedom, null for a
+    stated size. Both are absent in solutions of earlier versions.
     """
 
     source: str
@@ -297,7 +297,7 @@ class LostMotion(FileObject):
 
 
 class TableRemoval(FileObject):
-    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used to do so."""
+    """The table in force during the runs, whose side effects were subtracted from the readings, and the lost motion used for that."""
 
     crc: int | None = None
     lost_motion_mm: dict[str, LostMotion]
