@@ -118,7 +118,7 @@ def test_a_proposal_says_at_which_temperature_it_holds(shop, capsys):
 
 CHANGED: dict[str, tuple[Callable[[Site], Site], float, str]] = {
     "another machine": (lambda s: replace(s, name="other", doc=s.doc | {"name": "other"}), 0.0, "MACHINE: the table is for 'sim'"),
-    "another tool": (lambda s: replace(s, doc=s.doc | {"tool_mm": [0.0, 0.0, -90.0]}), 0.0, "MACHINE: the machine file differs"),
+    "another tool": (lambda s: replace(s, doc=s.doc | {"tool_mm": [0.0, 0.0, -90.0]}), 0.0, "MACHINE: the machine file has changed"),
     "another temperature window": (lambda s: replace(s, limits=replace(s.limits, temperature_c=(30.0, 32.0))), 0.0, "TEMPERATURE"),
     "a wider temperature window": (
         lambda s: replace(s, limits=replace(s.limits, temperature_c=(10.0, 40.0))),
