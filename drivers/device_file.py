@@ -122,7 +122,7 @@ class Command(DeviceTable):
 
     address: Register | None = None
     write: tuple[Word, ...] = ()
-    function: Literal[3, 4] = Field(default=3, description="Modbus: function code for reading the registers numbered and acknowledge")
+    function: Literal[3, 4] = Field(default=3, description="Modbus: function code with which `numbered` and `acknowledge` are read")
     numbered: Register | None = None
     acknowledge: Register | None = None
     becomes: Word = 0
@@ -151,7 +151,7 @@ class LineTable(DeviceTable):
     pattern: Pattern = Field(description="regular expression of a whole line; its named groups are values")
     error: Pattern = Field(default="", description="regular expression of a line that reports an error")
     who: Text = Field(default="", description="sent to ask for the identity")
-    answers: Pattern = Field(default="", description="regular expression of the identity; a group serial_no is kept")
+    answers: Pattern = Field(default="", description="regular expression of the identity; its group serial_no is the serial number")
     baud: int | None = Field(default=None, ge=300, le=12_000_000, description="serial; replaces the baud rate in the URL")
     parity: Literal["none", "even", "odd"] | None = None
     bits: Literal[7, 8] = 8

@@ -242,9 +242,9 @@ def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
     access = {key: query.pop(key) for key in (*SECRETS, *LOGIN) if key in query}
     wrong = ""
     if 0 < len(access.keys() & set(SECRETS)) < len(SECRETS):
-        wrong = "certificate, key and server need each other"
+        wrong = "certificate, key and server belong together"
     elif len(access.keys() & set(LOGIN)) == 1:
-        wrong = "user and password_file need each other"
+        wrong = "user and password_file belong together"
     elif "user" in access and "key" not in access:
         wrong = "a password is sent over an encrypted session only: certificate, key and server are missing"
     missing = [path for key, path in access.items() if key != "user" and not Path(path).is_file()]

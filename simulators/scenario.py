@@ -211,7 +211,7 @@ def _check_artefact(plate: ArtefactConfig, probe: ProbeConfig) -> None:
     if not (1 <= plate.columns <= 26 and 1 <= plate.rows <= 26):
         raise ScenarioError("artefact.columns, artefact.rows: must be 1..26")
     if not 0.0 < probe.radius_mm < plate.radius_mm < 0.5 * plate.pitch_mm:
-        raise ScenarioError("artefact.radius_mm: the probe's ball must fit into a hole, and a pitch must hold two features")
+        raise ScenarioError("artefact.radius_mm: the probe's ball must fit into a hole, and two features into a pitch")
 
 
 def parse_chain(chain: str) -> tuple[tuple[int, ...], tuple[int, ...]]:

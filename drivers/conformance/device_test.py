@@ -119,7 +119,7 @@ async def _played(probe: DeviceUnderTest, proxy: Proxy, fault: Fault, base: _Res
         number, good = sample.number, good + 1
     took = f"right again after {clock() - begun_s:.1f} s"
     return DeviceCheck(
-        name, CheckVerdict.PASSED, f"refused ({refused}), {took}" if refused else "overcome by the link: every reading was right"
+        name, CheckVerdict.PASSED, f"refused ({refused}), {took}" if refused else "the link overcame the fault: every reading was right"
     )
 
 
@@ -238,10 +238,10 @@ def abilities(kind: str, found: tuple[DeviceCheck, ...]) -> tuple[Ability, ...]:
 def summary(report: TestReport) -> str:
     """Return the abilities of the device in one line."""
     if report.failed:
-        return "it cannot be used; failed: " + "; ".join(one.check for one in report.failed)
+        return "the device cannot be used; failed: " + "; ".join(one.check for one in report.failed)
     if Ability.DWELL in report.abilities:
-        return "it can measure while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
-    return "it can be watched, but not used to measure; not proved: " + "; ".join(
+        return "the device can measure while the axes stand still, in an operator's NC program or in a motion that Abbe commands"
+    return "the device can be watched, but not used to measure; not proved: " + "; ".join(
         one.check for one in report.findings if one.verdict is CheckVerdict.NOT_PROVED
     )
 

@@ -153,7 +153,7 @@ class ControlProbe:
 
 
 class BarProbe:
-    """A ball-bar's stream; a requested sample is the newest that arrives after the request."""
+    """A ball-bar's stream; a sample is the last one of the first batch that arrives after the request."""
 
     moved: tuple[str, ...] = ("radius",)
 

@@ -343,7 +343,7 @@ def _query(text: str, parts: SplitResult, known: set[str]) -> dict[str, str]:
     if len(query) != len(pairs):
         raise _bad(text, "a key is given twice")
     if unknown := sorted(set(query) - known):
-        raise _bad(text, f"unknown key {unknown[0]!a}", f"known here: {', '.join(sorted(known)) or 'none'}")
+        raise _bad(text, f"unknown key {unknown[0]!a}", f"known keys: {', '.join(sorted(known)) or 'none'}")
     return query
 
 

@@ -128,7 +128,7 @@ def layout_line(number: Number) -> str:
 
 FORMAT: Literal["abbe-solution/1"] = "abbe-solution/1"
 Word = Literal["good", "usable with care", "mostly assumption"]
-HIDDEN_NOTE = "not observable by itself: for this tool only"
+HIDDEN_NOTE = "not observable by itself: the value holds for this tool only"
 NODES = 6
 """Nodes per axis of the grid over the strokes on which the uncertainty is evaluated."""
 LISTED = 20

@@ -57,7 +57,7 @@ def machine_grid(found: Assessment, nodes: int, lsb_mm: float) -> GridTable:
     mask = compensable_nodes(found.joint, counts, inputs=found.sources.inputs, scales=found.left_out)
     table = quantise_grid(grid_table(found.sources.solution, counts, compensable=mask, sources=found.sources), lsb_mm)
     if not table.compensated.any():
-        raise TableRefused("the error exceeds its uncertainty nowhere: there is nothing to compensate", "nothing was written")
+        raise TableRefused("the error is nowhere larger than its uncertainty: there is nothing to compensate", "nothing was written")
     return table
 
 

@@ -120,7 +120,7 @@ def _elements(file: TextFile, data: bytes) -> list[_Element]:
             stack[-1].parts.append(words)
 
     def declared(*_: object) -> None:
-        raise file.wrong(parser.CurrentLineNumber, "a document type: entities are not read", "export the file again")
+        raise file.wrong(parser.CurrentLineNumber, "a document type (DOCTYPE): entities are not read", "export the file again")
 
     parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
     parser.StartDoctypeDeclHandler = declared
@@ -142,7 +142,7 @@ def _utf8(file: TextFile, data: bytes) -> bytes:
     try:
         text = data[found.end() :].decode(encoding)
     except UnicodeDecodeError:
-        raise file.wrong(1, f"it is not in the encoding that it states, {encoding}", "export the file again") from None
+        raise file.wrong(1, f"the file is not in the encoding that it states, {encoding}", "export the file again") from None
     return b"\n" * found.group().count(b"\n") + text.encode()
 
 

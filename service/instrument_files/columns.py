@@ -315,7 +315,7 @@ def _places(body: _ReadingRows) -> tuple[F1, F1, str]:
         return np.full(n, at), np.ones(n), f"the axis stood at {at:g} mm: its readings are relative to the first one"
     target = body.numbers("target")[0] * LENGTHS[columns.target.unit]
     if columns.direction is None:
-        return target, _by_order(body, target), "the table has no column of the direction: the order of the targets decided the direction"
+        return target, _by_order(body, target), "the table has no direction column: the order of the targets decided the direction"
     return target, _by_words(body, columns.direction), ""
 
 
@@ -332,7 +332,8 @@ def _deviations(body: _ReadingRows, position: F1) -> tuple[F1, float, str]:
         value = value - position
     elif one.unit in LENGTHS and np.ptp(position) > 0.0 and np.abs(value - position).max() < POSITIONS_SHARE * np.ptp(position):
         far = int(np.abs(position).argmax())
-        raise body.wrong(far, f"the deviations follow the targets ({value[far]:g} mm at {position[far]:g} mm): is the column [measured]?")
+        follow = f"the deviations follow the targets ({value[far]:g} mm at {position[far]:g} mm)"
+        raise body.wrong(far, f"{follow}: are they positions? Then name the column [measured]")
     return value, step_of(words, unit), "angle" if one.unit in ANGLES else "length"
 
 

@@ -207,7 +207,7 @@ def _run_count(parts: _Sections, *, both: bool) -> int:
         raise file.wrong(at, "section RUNS:: must have exactly one line, Run-count")
     count = _whole(file, at, lines[0][1].partition(":")[2].strip(), "Run-count")
     if both and count % 2:
-        raise file.wrong(at, f"Run-count is {count}: a test in both directions has an even number of runs, its last run back is missing")
+        raise file.wrong(at, f"Run-count is {count}: a test in both directions has an even number of runs; its last run back is missing")
     return count
 
 

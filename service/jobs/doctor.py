@@ -64,7 +64,7 @@ async def examine(loaded: LoadedMachine, now: datetime) -> AsyncIterator[Examine
 def _file(loaded: LoadedMachine, now: datetime) -> Iterator[Examined]:
     found = check_plausibility(loaded.machine, loaded.path.resolve().parent, now.date())
     yield from (Examined("machine file", "bad", line, "correct the machine file") for line in found.errors)
-    yield from (Examined("machine file", "look", line, "correct the machine file, if it is not intended") for line in found.warnings)
+    yield from (Examined("machine file", "look", line, "correct the machine file if this is not intended") for line in found.warnings)
     if found.good:
         yield Examined("machine file", "good", str(loaded.path))
 

@@ -195,6 +195,6 @@ class _PromptedPerson:
 
 
 def named_for(context: InvestigationContext, recipe: str, resume: str = "") -> InvestigationContext:
-    """Return the context with its plan renamed: ``resume``, or made of recipe, machine and present time."""
+    """Return the context with its plan renamed to ``resume``; if that is empty, to recipe, machine and present time."""
     name = resume or f"{recipe} {context.site.name} {context.clock.utc():%Y-%m-%d %H:%M:%S}"
     return replace(context, plan=replace(context.plan, name=name))

@@ -354,7 +354,7 @@ def push_log(journal: Journal) -> tuple[str, ...]:
         known = facts((entry,))
         parts = [known.why, known.pending, known.again, known.approved_by, known.probe, known.verify]
         if entry.state is PushState.SNAPSHOT:
-            parts = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; to come: CRC {known.crc:08X}"]
+            parts = [f"bank {known.base_bank}, CRC {known.base_crc:08X}; new table: CRC {known.crc:08X}"]
         lines.append(": ".join([str(entry.state), *filter(None, parts)]) + f" ({entry.utc})")
     return tuple(lines)
 

@@ -143,7 +143,7 @@ def _precheck(f: PushFacts, known: PushKnowledge) -> Operation:
     truth = known.truth
     if truth is None:
         return Operation(OperationKind.LOOK)
-    why = _changed(f, truth, f.gen) or ("the axes have not stood long enough" if truth.still_s < STILL_S else "")
+    why = _changed(f, truth, f.gen) or ("the axes have not stood still long enough" if truth.still_s < STILL_S else "")
     if not why and truth.states[f.target] is BankState.LAID_ASIDE:
         why = "a table is laid aside for the control's next start: restart the control, or remove that table first"
     if why:

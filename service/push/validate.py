@@ -212,7 +212,7 @@ def _form(c: Candidate, context: CandidateContext) -> Iterator[str]:
         return
     registers = HEADER_REGISTERS + sum(len(column.correction_mm) for column in c.columns)
     if registers > context.bank_registers:
-        yield f"FORM SIZE: {registers} registers, a bank has {context.bank_registers}"
+        yield f"FORM SIZE: the table needs {registers} registers, a bank has {context.bank_registers}"
     for column in c.columns:
         reason = _column_form(column, context)
         if reason:
@@ -222,14 +222,14 @@ def _form(c: Candidate, context: CandidateContext) -> Iterator[str]:
 def _column_form(column: Column, context: CandidateContext) -> str:
     position, n = column.position_mm, len(column.position_mm)
     if n < 2 or len(column.correction_mm) != n or (column.left_mm and len(column.left_mm) != n):
-        return f"SIZE: {n} positions, {len(column.correction_mm)} corrections, {len(column.left_mm)} residuals"
+        return f"SIZE: {n} positions, but {len(column.correction_mm)} corrections and {len(column.left_mm)} residuals"
     if column.reverse_mm and len(column.reverse_mm) != n:
-        return f"SIZE: {len(column.reverse_mm)} reverse values, {n} positions"
+        return f"SIZE: {len(column.reverse_mm)} reverse values, but {n} positions"
     if not all(b > a for a, b in pairwise(position)):
         return "POSITIONS: the positions do not increase strictly"
     low, high = context.travel_mm[column.moved]
     if not low - 1e-6 <= position[0] <= position[-1] <= high + 1e-6:
-        return f"TRAVEL: {position[0]:g} to {position[-1]:g} mm, the axis goes from {low:g} to {high:g} mm"
+        return f"TRAVEL: the table covers {position[0]:g} to {position[-1]:g} mm, the axis goes from {low:g} to {high:g} mm"
     grid = context.grid_mm.get(column.moved)
     if grid is not None and (len(grid) != n or any(abs(a - b) > 1e-5 for a, b in zip(grid, position, strict=False))):
         return "GRID: not the controller's grid"
@@ -250,7 +250,7 @@ def _evidence(c: Candidate, context: CandidateContext, limits: PushLimits) -> It
     if not low <= e.temperature_c[0] <= e.temperature_c[1] <= high:
         yield f"TEMPERATURE: {e.temperature_c[0]:.1f} to {e.temperature_c[1]:.1f} °C, the limits are {low:g} to {high:g} °C"
     if e.run_count < limits.runs:
-        yield f"RUNS: {e.run_count}, but {limits.runs} are needed"
+        yield f"RUNS: {e.run_count} measured, but {limits.runs} are needed"
     if drift := drift_reason(e.drift_mm, limits):
         yield drift
     if promise := promise_reason(e.before_mm, e.after_mm, e.u_mm, limits):

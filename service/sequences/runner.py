@@ -51,7 +51,7 @@ async def read_bar(ballbar: BallBar, step: ReadBar, status: ControllerStatus, he
     Raises
     ------
     BarOutOfRange, MeasurementFault
-        The box flags a sample as out of range or taken without a bar; samples are lost.
+        The box flags a sample as out of range or taken without a bar, or samples are lost.
     """
     samples: list[BarSample] = []
     host_s = status.host_s

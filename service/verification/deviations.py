@@ -204,7 +204,7 @@ def _notes(known: KnownErrors, points: PointsFile) -> list[str]:
         reverse = [key for key in known.motions.functions if key.endswith(letter + REVERSE)]
         if reverse and axis not in points.directed:
             unused = ", ".join(reverse)
-            notes.append(f"no column direction_{letter.lower()}: {letter} is taken as last moved in +, and {unused} is not used")
+            notes.append(f"no column direction_{letter.lower()}: Abbe assumes that {letter} last moved in +, and {unused} is not used")
     return notes + _ends(known.motions, points)
 
 

@@ -26,7 +26,7 @@ AT_20, DIAGONAL_AT_20 = "ISO 230-2 at 20 °C", "ISO 230-6 at 20 °C"
 REDUCTION_STATEMENT = (
     "Reduction to 20 °C (ISO 230-2 and 230-6, nominal differential expansion): deviation as measured - (scale - laser) (t - 20 °C) "
     "travel, where the laser's coefficient is the one set in its own compensation of material, 0 if that is off; on a diagonal each axis "
-    "counts with the square of its share of the direction. U of the figures as measured includes the uncertainty of t, and the same for "
+    "counts with the square of its share of the direction. U of the figures as measured includes the uncertainty of t, and of "
     "the laser's own sensor if its compensation is on; U of the reduced figures also includes the uncertainty of the scale's coefficient "
     "(ISO/TR 16015). Each figure is evaluated again with the deviations tilted by plus and minus this uncertainty. The reduced figures "
     "are the result by the standard. Figures of a workpiece use its coefficient instead of the scale's: they are the deviations at 20 °C "

@@ -26,8 +26,8 @@ if TYPE_CHECKING:
 
 COVERAGE = 2.0
 WORSE_SHARE = 0.1
-"""A figure may get worse by its U plus this share of a reference: the worst diagonal before for a diagonal and its reversal, the figure
-before for a helix."""
+"""Share by which a figure may get worse in addition to its U: a diagonal and its reversal by this share of the worst diagonal before the
+push, a helix by this share of its own value before."""
 
 SAME_AIR_C = 1.0
 """Largest range of air temperature over all readings before and after: steel and iron grow by 11 to 12 um per metre and kelvin, which is

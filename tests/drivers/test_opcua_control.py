@@ -182,8 +182,8 @@ async def test_an_encrypted_control_with_users_is_read_and_no_other_server_is_sp
 @pytest.mark.parametrize(
     ("more", "words"),
     [
-        ("&certificate={0}", "certificate, key and server need each other"),
-        ("&user=abbe", "user and password_file need each other"),
+        ("&certificate={0}", "certificate, key and server belong together"),
+        ("&user=abbe", "user and password_file belong together"),
         ("&user=abbe&password_file={0}", "over an encrypted session only"),
         ("&certificate={0}&key={0}&server=gone.der", "gone.der: no such file"),
         ("&certificate={0}&key={0}&server={0}", "certificate, key or password:"),

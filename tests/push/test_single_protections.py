@@ -56,7 +56,7 @@ def test_axes_that_have_only_just_come_to_rest_are_not_pushed_into(still_s: floa
     assert world.run() == []
     assert states(world)[-1] == end
     if end == "ABORTED":
-        assert "not stood long enough" in world.journal[-1].doc["why"]
+        assert "not stood still long enough" in world.journal[-1].doc["why"]
         assert issued(world, "WRITE", "SEAL", "ACTIVATE") == []
 
 

@@ -220,7 +220,7 @@ class OpcUaServer:
         try:
             space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine, companions=has_companions())
         except NodesetBroken as broken:
-            log.error("companion specification cannot be read; served without", reason=str(broken))
+            log.error("companion specification cannot be read; the server runs without it", reason=str(broken))
             server = await self._make()
             space = await Space.built(server, await server.register_namespace(NAMESPACE), self._machine, companions=False)
         events = await Events.prepared(server, space.types, space.root, self._clock.utc())

@@ -297,7 +297,7 @@ def _minutes(made: Program, took: Runtime) -> str:
 def _runtime_comments(took: Runtime, pace: PathDynamics) -> tuple[str, str]:
     """Return comments with the run time, rounded up: the operator should wait less than announced, not longer."""
     return (
-        f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells; not counted are"
+        f"runs {math.ceil(took.total_s / 60.0)} min: {took.moving_s:.0f} s of moves, {took.resting_s:.0f} s of dwells, without"
         " the stops for a person and the way to the first position",
         f"computed with {pace.acceleration_mm_s2:g} mm/s2 along the path, {pace.stop_s:g} s at each exact stop, feed override 100 percent",
     )

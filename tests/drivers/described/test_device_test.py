@@ -62,7 +62,7 @@ async def test_the_foreign_meter_passes_and_measures(url: str, world: World, tmp
     assert verdict(report, "quality") == ("passed", "an invalid reading is refused: beam lost")
     played = [one for one in report.findings if one.check.startswith(("reply", "connection"))]
     assert [one.check for one in played] == ["reply late", "reply doubled", "reply spoilt", "reply missing", "connection cut"]
-    assert summary(report).startswith("it can measure")
+    assert summary(report).startswith("the device can measure")
     meter = await open_laser(f"{url}&tested={kept(report, tmp_path)}")
     await meter.close()
 

@@ -131,7 +131,7 @@ async def test_a_temperature_logger_is_only_shown(value: Path) -> None:
     with over_tcp("logger", value) as url:
         report = await device_test(f"{url}?device=temperature-logger", Options(faults=False), UTC)
         assert (report.failed, report.abilities) == ((), (Ability.WATCH,))
-        assert summary(report).startswith("it can be watched, but not used to measure")
+        assert summary(report).startswith("the device can be watched, but not used to measure")
         about = described(parse_url(f"{url}?device=temperature-logger"))
         source = await open_source(about.url, about.file)
         assert (await source.snapshot()).counts == {"temperature": 20.43}

@@ -70,7 +70,7 @@ def test_without_a_known_motion_a_device_is_only_shown_and_the_report_says_so(
     out = capsys.readouterr().out
     assert "digital dial gauge SN 1" in out
     assert "not proved motion displacement: no known motion was made (--move)" in out
-    assert "it can be watched, but not used to measure; not proved: motion displacement" in out
+    assert "the device can be watched, but not used to measure; not proved: motion displacement" in out
     assert json.loads(report.read_text())["abilities"] == ["watch"]
 
 

@@ -130,7 +130,7 @@ def test_a_tool_of_each_point_replaces_the_machines(bench: Bench) -> None:
 
 
 def test_reverse_functions_hold_where_the_axis_last_moved_in_minus(bench: Bench) -> None:
-    assert "no column direction_x: X is taken as last moved in +, and EXX@reverse is not used" in bench.doc()["warnings"]
+    assert "no column direction_x: Abbe assumes that X last moved in +, and EXX@reverse is not used" in bench.doc()["warnings"]
     signs = [-1, 1, -1, 0]
     bench.csv(np.hstack([np.array(signs, dtype=object)[:, None], POINTS]), " direction_x , x_mm,y_mm,z_mm")
     doc = bench.doc()
