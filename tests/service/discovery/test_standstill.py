@@ -110,4 +110,4 @@ def test_eighteen_days_of_a_lathe(abbe: Abbe, shared: Path) -> None:
     (shift,) = [one for one in doc["shifts"] if one["model"] == "absolute"]
     assert (shift["first"], shift["last"]) == ("r15", "r18")
     assert shift["p"] < 0.01
-    assert "from run r15 on the displacement is +13" in abbe("discover", "lathe").out
+    assert "from run r15 on the displacement differs by +13" in abbe("discover", "lathe").out
