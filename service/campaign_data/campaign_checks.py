@@ -398,4 +398,4 @@ def _suspect(s: SuspectRun, *, single: bool) -> CampaignIssue:
 
 
 def _misfit(s: SuspectRun) -> str:
-    return f"off by {s.misfit_mm * 1e3:.2g} µm rms where {s.expected_mm * 1e3:.2g} are expected"
+    return f"off by {s.misfit_mm * 1e3:.2g} µm rms, expected {s.expected_mm * 1e3:.2g} µm"

@@ -167,7 +167,7 @@ def _sequence(setup: LaserSetup, points: F2) -> GeometryMistake | None:
     if (moved.sum(axis=1) == 1).all() and not (moved == wanted).all():
         first = "".join("XYZ"[int(np.argmax(row))] for row in moved[:3])
         return GeometryMistake(
-            f"steps go in the order {first}, the run says {order}: columns are exchanged or order is wrong", "correct the file"
+            f"steps go in the order {first}, the run says {order}: columns are exchanged, or the key order is wrong", "correct the file"
         )
     return None
 

@@ -59,7 +59,7 @@ class LatestReading:
         return self._now_s() - host_s > OLD_S
 
     def _utc_ms(self, of: str, host_s: float) -> float:
-        """UTC of an answer, computed once: the page tells a new answer by its time."""
+        """UTC of an answer, computed once: the page recognizes a new answer by its time."""
         if of not in self._stamps or self._stamps[of][0] != host_s:
             self._stamps[of] = host_s, 1e3 * (self._clock.utc().timestamp() - (self._now_s() - host_s))
         return self._stamps[of][1]

@@ -1,7 +1,7 @@
 """The service pushes an approved proposal unattended, where the machine file allows it, through the same gate as any push.
 
 An unattended push needs a control proved to level 3, a valid approval (even where two people are not demanded), enough time since the
-last push, and tables that have not drifted too far in 30 days. Each push first measures its own verification.
+last push, and tables close enough to those of 30 days ago. Each push first measures its own verification.
 """
 
 from __future__ import annotations

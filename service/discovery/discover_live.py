@@ -132,7 +132,7 @@ async def measure_added(
     status, comp = await session.controller.status(), await session.controller.comp_status()
     old = campaign.head
     if old.ctrl0_us is None or old.boot_id != comp.boot_id or old.ctrl0_us > status.ctrl_us:
-        raise CampaignRefused(f"campaign {campaign.name} was measured before the controller restarted, or elsewhere", NO_CLOCK)
+        raise CampaignRefused(f"campaign {campaign.name} was measured before the controller restarted, or on another controller", NO_CLOCK)
     now = comp.bank_crc[comp.active_bank]
     tables = {run.table.crc for run in campaign.runs} - {None, now}
     if tables:

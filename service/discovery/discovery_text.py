@@ -209,7 +209,7 @@ def next_of(finding: Finding) -> list[str]:
         there = "; ".join(location_lines(finding.location))
         what = f"repeat the measurement where the gap appears ({there})" if there else "repeat the whole campaign: the gap was not located"
         return [
-            f"measure next: {what}, and again later: a gap that recurs belongs to the machine, a gap that does not recur to that session"
+            f"measure next: {what}, and again later: a gap that recurs belongs to the machine, one that vanishes belongs to that session"
         ]
     if finding.verdict == "none":
         again = "measure next: repeat the runs that were never fitted and disagree, some of them with the role identify"

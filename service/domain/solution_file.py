@@ -185,9 +185,10 @@ class WithoutScale(FileObject):
 
 
 class Uncertainty(FileObject):
-    """Uncertainty of the predicted deviation over the volume. ``compensable_share``: share of the volume where the error exceeds it.
+    """Uncertainty of the predicted deviation over the volume.
 
-    ``without_scale``: what is known without the scales, if they are the largest part of the uncertainty.
+    ``compensable_share``: share of the volume where the error exceeds its uncertainty. ``without_scale``: what is known without the scales,
+    if they are the largest part of the uncertainty.
     """
 
     frame: str

@@ -273,7 +273,7 @@ def test_what_is_left_needs_the_clock_of_the_first_runs_and_what_is_complete_nee
     assert bench.live(ended_in_the_second_run) is None
     bench.boot += 1  # switched off and on
     assert bench.live() == 2
-    assert "error SOL-003: campaign june was measured before the controller restarted, or elsewhere" in capsys.readouterr().err
+    assert "error SOL-003: campaign june was measured before the controller restarted, or on another controller" in capsys.readouterr().err
     assert bench.measured == [*ROUND_1]
     bench.boot -= 1
     assert bench.live(6 - 3 + 3) is None  # up to the second run's second try, and the state that follows
