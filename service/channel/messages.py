@@ -285,7 +285,7 @@ def from_web(body: bytes) -> FromWeb:
 
 def _checked(adapter: TypeAdapter[T], body: bytes) -> T:
     if len(body) > LARGEST_B:
-        raise ChannelBroken(f"a message of {len(body)} bytes between core and web process; allowed are {LARGEST_B}")
+        raise ChannelBroken(f"a message of {len(body)} bytes between core and web process; the limit is {LARGEST_B}")
     try:
         return adapter.validate_json(body)
     except ValidationError as wrong:
@@ -338,7 +338,7 @@ class Wire:
         try:
             (size,) = _LENGTH.unpack(await self._reader.readexactly(_LENGTH.size))
             if size > LARGEST_B:
-                raise ChannelBroken(f"a message of {size} bytes was announced between core and web process; allowed are {LARGEST_B}")
+                raise ChannelBroken(f"a message of {size} bytes was announced between core and web process; the limit is {LARGEST_B}")
             return await self._reader.readexactly(size)
         except (asyncio.IncompleteReadError, ConnectionError):
             return None

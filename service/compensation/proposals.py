@@ -366,7 +366,7 @@ def check_temperature(site: Site, runs: list[Run]) -> None:
         for t in run.columns.air_c:
             if not low <= t <= high:
                 raise TableRefused(
-                    f"run {run.run_id} was measured at {t:.1f} °C air, allowed are {low:g} to {high:g} °C",
+                    f"run {run.run_id} was measured at {t:.1f} °C air, the limits are {low:g} to {high:g} °C",
                     "measure again when the shop has settled, or change temperature_c under [limits]; nothing was written",
                 )
 

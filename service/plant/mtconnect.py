@@ -37,7 +37,7 @@ AGENT_ITEMS = (
     ("removed", "EVENT", "DEVICE_REMOVED", ""),
     ("changed", "EVENT", "DEVICE_CHANGED", ""),
 )
-"""Data items of the agent itself, which MTConnect 1.7 and later require as a device."""
+"""Data items of the agent: MTConnect 1.7 and later require that it is a device itself."""
 _NAMES = {"result": "last_check", "table": "compensation_table"}
 
 

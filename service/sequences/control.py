@@ -56,7 +56,7 @@ CAN_CLEAR = frozenset({"door", "beam", "temperature"})
 
 @dataclass(frozen=True, slots=True)
 class Suspending:
-    """Conditions (of `CAN_CLEAR`) that suspend a measurement until they clear; without any, every condition ends the run.
+    """Conditions (of `CAN_CLEAR`) that suspend a measurement until they clear; if there are none, every condition ends the run.
 
     ``longest_s``: longest suspension; ``settle_s``: how long all conditions must be clear before the measurement resumes (host s).
     """

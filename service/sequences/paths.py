@@ -41,7 +41,7 @@ class Recorder(Protocol):
 
 
 STOP_S = 10.0
-"""Longest time for a stop, s. The driver gives up earlier: it waits seconds for each write, and five until the axes stand."""
+"""Longest time for a stop, s. The driver gives up earlier: it waits a few seconds for each write, and 5 s until the axes stand."""
 Spare = Callable[[], Awaitable[bool]]
 UNDELIVERED = "the stop could not be delivered: press e-stop"
 

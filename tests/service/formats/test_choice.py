@@ -189,7 +189,7 @@ def test_tables_without_a_scale_that_the_runs_hardly_tell(tmp_path: Path, capsys
 
     source.write_text(json.dumps(_document(known)))
     assert run([*export, "--without-scale"]) == 2
-    assert "determines the scales no worse than the rest" in capsys.readouterr().err
+    assert "determines the scales as well as the rest" in capsys.readouterr().err
 
 
 def test_the_measured_step_turns_the_sign_where_no_manual_states_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
