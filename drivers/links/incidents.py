@@ -1,4 +1,4 @@
-"""Incidents of a link as a readable list. An incident has two entries, detection and outcome, for any number of errors.
+"""Incidents of a link as a readable list. An incident has two entries, its detection and its outcome, however many errors it has.
 
 `Backoff` determines the wait before the next attempt at a lost link.
 """

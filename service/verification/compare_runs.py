@@ -197,7 +197,7 @@ def difference(first: ComparedCurve, second: ComparedCurve) -> RunDifference | N
 def figure_rows(loaded: Sequence[LoadedRun]) -> list[FigureRow]:
     """Figures with a unit that all runs have, in the order of the first run.
 
-    The uncertainty of a difference treats both values as independent. This is safe: with a shared laser or bar the true uncertainty is smaller.
+    The uncertainty of a difference treats both values as independent. This is safe: a shared laser or bar makes the true one smaller.
     """
     tables = [{(f.symbol, f.name): f for f in one.figures if f.unit} for one in loaded]
     out = []
