@@ -92,7 +92,7 @@ class TableEvidence:
     """The measurement and the prediction behind a table. Lengths mm; ``machine_mark``: see `CandidateContext`.
 
     ``before_mm``, ``after_mm``, ``u_mm``: predicted rms without and with the table, and the model's standard uncertainty. ``drift_mm``: rms
-    residual of the solution in a newer run, 0 if there is none. ``temperature_c``: lowest and highest air temperature. ``ended_s``, ``last_s``:
+    residual of the solution in a newer run, 0 if none. ``temperature_c``: lowest and highest air temperature. ``ended_s``, ``last_s``:
     end of the oldest and of the newest run, seconds UTC; ``last_s`` None: the same as ``ended_s``.
     ``reached_mm``: lowest and highest position of each axis in the runs; empty if it is not known.
     """
