@@ -12,7 +12,7 @@ from pydantic import AfterValidator, Field, field_validator, model_validator
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import is_url_of
 from abbe.service.domain.machine import AxisMaterial, Chain, ConfigTable, Interval, Issuer, Item, Point
-from abbe.service.domain.machine_file import CaptureSettings
+from abbe.service.domain.machine_file import CaptureSettings, Loosens
 from abbe.service.domain.schedule import Schedule, Window, complete, one_way
 from abbe.service.errors import AbbeError
 from abbe.service.mqtt.broker import parse as parse_broker
@@ -137,40 +137,48 @@ class StoreSection(ConfigTable):
 class Limits(ConfigTable):
     """Limits that must never be exceeded. A table beyond a limit is refused, not clamped."""
 
-    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(default=100.0, description="largest correction at any grid point")
-    table_change_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
+    table_value_um: Annotated[float, Field(gt=0.0, le=3276.7), Loosens("more")] = Field(
+        default=100.0, description="largest correction at any grid point"
+    )
+    table_change_um: Annotated[float, Field(gt=0.0, le=6553.4), Loosens("more")] = Field(
         default=50.0,
         description="largest change of a correction against the active table; the first push on an uncorrected "
         "machine may need more: look at the proposal first",
     )
-    table_step_um: Annotated[float, Field(gt=0.0, le=3276.7)] = Field(
+    table_step_um: Annotated[float, Field(gt=0.0, le=3276.7), Loosens("more")] = Field(
         default=20.0, description="largest change between neighbouring grid points"
     )
-    table_beyond_percent: Annotated[float, Field(ge=0.0, le=100.0)] = Field(
+    table_beyond_percent: Annotated[float, Field(ge=0.0, le=100.0), Loosens("more")] = Field(
         default=25.0, description="largest part of a stroke that a table corrects beyond the measured positions, at either end"
     )
-    table_walk_um: Annotated[float, Field(gt=0.0, le=6553.4)] = Field(
+    table_walk_um: Annotated[float, Field(gt=0.0, le=6553.4), Loosens("more")] = Field(
         default=50.0, description="largest change of a correction over 30 days by unattended pushes ([alarm] push)"
     )
-    measurement_age_h: Annotated[float, Field(gt=0.0, le=8760.0)] = Field(
+    measurement_age_h: Annotated[float, Field(gt=0.0, le=8760.0), Loosens("more")] = Field(
         default=72.0, description="a table is only written from runs of at most this age"
     )
-    two_people: bool = Field(
+    two_people: Annotated[bool, Loosens("less")] = Field(
         default=False,
         description="a proposed table is only pushed after a person other than its proposer has approved it (`abbe comp approve`)",
     )
-    feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0)] = Field(default=6000.0, description="fastest feed of any measurement")
-    temperature_c: Temperatures = Field(default=(18.0, 24.0), description="permitted air temperature of a measurement")
-    run_temperature_c: Temperatures | None = Field(
+    feed_mm_min: Annotated[float, Field(gt=0.0, le=100_000.0), Loosens("more")] = Field(
+        default=6000.0, description="fastest feed of any measurement"
+    )
+    temperature_c: Annotated[Temperatures, Loosens("wider")] = Field(
+        default=(18.0, 24.0), description="permitted air temperature of a measurement"
+    )
+    run_temperature_c: Annotated[Temperatures | None, Loosens("wider")] = Field(
         default=None, description="air temperature, read from the laser, outside which a running measurement stops; absent: not watched"
     )
-    continue_after: list[Literal["door", "beam", "temperature", "ballbar"]] = Field(
+    continue_after: Annotated[list[Literal["door", "beam", "temperature", "ballbar"]], Loosens("added")] = Field(
         default_factory=list,
         description="conditions that only suspend a measurement, which resumes by itself when they have cleared; e-stop and alarm always "
         "end it. Condition ballbar: the box of the ball-bar lost its connection or restarted; it clears when the box answers again",
     )
-    suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0)] = Field(default=1800.0, description="longest suspension; after it the run ends")
-    settle_s: Annotated[float, Field(ge=0.0, le=3600.0)] = Field(
+    suspend_s: Annotated[float, Field(gt=0.0, le=86_400.0), Loosens("more")] = Field(
+        default=1800.0, description="longest suspension; after it the run ends"
+    )
+    settle_s: Annotated[float, Field(ge=0.0, le=3600.0), Loosens("less")] = Field(
         default=10.0, description="how long all conditions must be clear before the measurement resumes"
     )
 
@@ -260,20 +268,24 @@ class Material(ConfigTable):
 class Calibration(ConfigTable):
     """Last days of the instruments' certificates. No table is written from an instrument without a valid certificate."""
 
-    ballbar: Certificate = Field(default=None, description="last day of the ball-bar's certificate, e.g. 2027-05-31")
-    laser: Certificate = Field(default=None, description="last day of the laser's certificate")
+    ballbar: Annotated[Certificate, Loosens("later")] = Field(
+        default=None, description="last day of the ball-bar's certificate, e.g. 2027-05-31"
+    )
     ballbar_is: str = Field(
         default="", max_length=400, description="maker, model and serial of the ball-bar; number and laboratory of its certificate"
     )
+    laser: Annotated[Certificate, Loosens("later")] = Field(default=None, description="last day of the laser's certificate")
     laser_is: str = Field(default="", max_length=400, description="the same facts for the laser")
-    artefact: Certificate = Field(
+    artefact: Annotated[Certificate, Loosens("later")] = Field(
         default=None,
         description="last day of the certificate of the artefact's length; without a calibrated length: of the touch probe's test (ISO "
         "230-10)",
     )
     artefact_is: str = Field(default="", max_length=400, description="the same facts for the artefact")
-    room: Certificate = Field(default=None, description="last day for which somebody confirmed room_temperature_c")
-    room_temperature_c: Temperatures | None = Field(
+    room: Annotated[Certificate, Loosens("later")] = Field(
+        default=None, description="last day for which somebody confirmed room_temperature_c"
+    )
+    room_temperature_c: Annotated[Temperatures | None, Loosens("stated")] = Field(
         default=None,
         description="lowest and highest air temperature by the room's own thermometer, at most 1 K apart; only for a machine without a "
         "laser, whose sensor would read the air",
@@ -318,9 +330,11 @@ class Nc(ConfigTable):
 class Verify(ConfigTable):
     """Limits of the scheduled check: a machine above any of them fails."""
 
-    body_diagonal_um: Positive = Field(default=20.0, description="range of the deviation along the worst body diagonal")
-    helix_rms_um: Positive = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
-    reversal_um: Positive | None = Field(
+    body_diagonal_um: Annotated[Positive, Loosens("more")] = Field(
+        default=20.0, description="range of the deviation along the worst body diagonal"
+    )
+    helix_rms_um: Annotated[Positive, Loosens("more")] = Field(default=5.0, description="rms of the ball-bar residual on the check helix")
+    reversal_um: Annotated[Positive | None, Loosens("higher")] = Field(
         default=None, description="largest mean reversal value of a body diagonal; absent: it is measured, but not judged"
     )
 

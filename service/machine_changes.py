@@ -11,11 +11,13 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from datetime import date
 from types import MappingProxyType
-from typing import Any, Literal
+from typing import Any
 
 from abbe.service.config import LoadedMachine, parse_machine, text_of
-from abbe.service.domain.machine_file import FileEdit
+from abbe.service.config_schema import Calibration, Limits, Verify
+from abbe.service.domain.machine_file import FileEdit, Looser, loosening
 from abbe.service.domain.people import Permission
+from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import ConfigError
 from abbe.service.toml_text import NotEditableError, edited
 
@@ -32,52 +34,14 @@ RIGHTS: Mapping[str, Permission] = MappingProxyType(
 )
 """Sections that the page can change, each with the right that a user needs. It cannot change addresses, geometry, store, page, keys and
 rights."""
-Looser = Literal["more", "higher", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
 LOOSER: Mapping[str, Looser] = MappingProxyType(
     {
-        **dict.fromkeys(
-            (
-                "limits.table_value_um",
-                "limits.table_change_um",
-                "limits.table_step_um",
-                "limits.table_beyond_percent",
-                "limits.table_walk_um",
-                "limits.measurement_age_h",
-                "limits.feed_mm_min",
-                "limits.suspend_s",
-                "verify.body_diagonal_um",
-                "verify.helix_rms_um",
-            ),
-            "more",
-        ),
-        "verify.reversal_um": "higher",
-        "limits.two_people": "less",
-        "limits.settle_s": "less",
-        "limits.temperature_c": "wider",
-        "limits.run_temperature_c": "wider",
-        "limits.continue_after": "added",
-        "calibration.ballbar": "later",
-        "calibration.laser": "later",
-        "calibration.artefact": "later",
-        "calibration.room": "later",
-        "calibration.room_temperature_c": "stated",
-        # When, how often and under which conditions the machine moves without a person.
-        **dict.fromkeys((f"schedule.{key}" for key in ("recipe", "cron", "timezone", "every_h", "first")), "changed"),
-        "schedule.grace_s": "more",
-        "schedule.catch_up": "raised",
-        "schedule.on_alarm": "raised",
-        "schedule.needs.idle": "less",
-        "schedule.needs.warm_min": "less",
-        "schedule.needs.air": "less",
-        "schedule.needs.operator": "dropped",
-        "schedule.name": "stated",
+        f"{section}.{key}": when
+        for section, table in (("limits", Limits), ("verify", Verify), ("calibration", Calibration), ("schedule", Schedule))
+        for key, when in loosening(table).items()
     }
 )
-"""Which new value of a key allows more than the old one. ``more``: a larger value; ``less``: a smaller one; ``higher``: a larger one, or
-none; ``wider``: a range that is not inside the old one, or none; ``added``: a list with further entries; ``later``: a later day, or the
-first; ``stated``: any value, but not none; ``changed``: any other value; ``raised``: any other value that is not in `UNRAISED`;
-``dropped``: any other value, if the old one was not ``any``. Of a new schedule only the name is judged; a removed schedule allows no more
-than before."""
+"""Keys that may allow more, and when. Of a new schedule only the name is judged; a removed schedule allows no more than before."""
 UNRAISED = ("skip", "none")
 _IS_LOOSER: Mapping[Looser, Callable[[Any, Any], bool]] = MappingProxyType(
     {

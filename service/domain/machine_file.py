@@ -3,17 +3,44 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from dataclasses import dataclass, is_dataclass, replace
+from typing import Annotated, Literal, get_type_hints
 
 from pydantic import Field
 
 from abbe.service.domain.document import Number, Text, Word
 
 Origin = Literal["default", "file", "environment"]
+Looser = Literal["more", "higher", "less", "wider", "added", "later", "stated", "changed", "raised", "dropped"]
+"""Which new value of a key allows more than the old one. ``more``: a larger value; ``less``: a smaller one; ``higher``: a larger one, or
+none; ``wider``: a range that is not inside the old one, or none; ``added``: a list with further entries; ``later``: a later day, or the
+first; ``stated``: any value, but not none; ``changed``: any other value; ``raised``: any other value, but not ``skip`` or ``none``;
+``dropped``: any other value, if the old one was not ``any``."""
 MOST_VALUES = 5000
 ABOUT_BYTES = 80
 """Largest size of a value's JSON besides its key and its text, bytes."""
+
+
+@dataclass(frozen=True, slots=True)
+class Loosens:
+    """Annotation of a key that a person may change on the page: ``when`` its new value allows more than the old one, which needs a reason.
+
+    A key without this annotation allows nothing.
+    """
+
+    when: Looser
+
+
+def loosening(table: type) -> dict[str, Looser]:
+    """The keys of a table of the machine file that may allow more, as dotted names, e.g. ``needs.idle``."""
+    found: dict[str, Looser] = {}
+    for key, hint in get_type_hints(table, include_extras=True).items():
+        for one in getattr(hint, "__metadata__", ()):
+            if isinstance(one, Loosens):
+                found[key] = one.when
+        if isinstance(hint, type) and is_dataclass(hint):
+            found |= {f"{key}.{inner}": when for inner, when in loosening(hint).items()}
+    return found
 
 
 @dataclass(frozen=True, slots=True)

@@ -14,6 +14,7 @@ from cronsim import CronSim, CronSimError
 from pydantic import AfterValidator, AwareDatetime, Field
 
 from abbe.service.domain.document import WORD
+from abbe.service.domain.machine_file import Loosens
 
 FIRST_UTC = datetime(2026, 1, 1, tzinfo=UTC)
 """Instant from which intervals are counted, unless the machine file names another."""
@@ -55,18 +56,20 @@ Cron = Annotated[str, AfterValidator(_cron)]
 class Needs:
     """Conditions for the start of a check; during its grace the check waits for them."""
 
-    idle: Annotated[bool, Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
+    idle: Annotated[bool, Loosens("less"), Field(description="controller ready, nothing moves, no NC program, spindle off")] = False
     warm_min: Annotated[
         float,
+        Loosens("less"),
         Field(
             ge=0.0,
             le=50.0,
             description="least number of minutes, of the last 60, in which the service saw the spindle turn or an axis move",
         ),
     ] = 0.0
-    air: Annotated[bool, Field(description="air temperature (of the laser) inside [limits] temperature_c")] = False
+    air: Annotated[bool, Loosens("less"), Field(description="air temperature (of the laser) inside [limits] temperature_c")] = False
     operator: Annotated[
         Literal["any", "present", "absent"],
+        Loosens("dropped"),
         Field(description="whether an operator is there, by [[staffed]]; absent also requires a shut door"),
     ] = "any"
 
@@ -75,25 +78,35 @@ class Needs:
 class Schedule:
     """One line of the timetable: by cron expression or by interval. Its name is part of the key by which each slot runs only once."""
 
-    name: Name
-    cron: Annotated[Cron, Field(description="minute hour day month weekday, e.g. 0 6 * * 1 (Monday); six fields: seconds first")] = ""
-    timezone: Zone = "UTC"
-    recipe: Annotated[Name, Field(description="what to measure")] = "quick-check"
+    name: Annotated[Name, Loosens("stated")]
+    cron: Annotated[
+        Cron, Loosens("changed"), Field(description="minute hour day month weekday, e.g. 0 6 * * 1 (Monday); six fields: seconds first")
+    ] = ""
+    timezone: Annotated[Zone, Loosens("changed")] = "UTC"
+    recipe: Annotated[Name, Loosens("changed"), Field(description="what to measure")] = "quick-check"
     grace_s: Annotated[
         float,
+        Loosens("more"),
         Field(ge=1.0, le=86_400.0, description="how late a slot may start; after that it counts as missed"),
     ] = 300.0
     every_h: Annotated[
-        float, AfterValidator(_interval), Field(le=8784.0, description="instead of cron: interval in hours (1/60 or more)")
+        float,
+        AfterValidator(_interval),
+        Loosens("changed"),
+        Field(le=8784.0, description="instead of cron: interval in hours (1/60 or more)"),
     ] = 0.0
-    first: Annotated[AwareDatetime, Field(description="a moment from which every_h is counted, e.g. 2026-11-02T06:00:00+01:00")] = FIRST_UTC
+    first: Annotated[
+        AwareDatetime, Loosens("changed"), Field(description="a moment from which every_h is counted, e.g. 2026-11-02T06:00:00+01:00")
+    ] = FIRST_UTC
     catch_up: Annotated[
         Literal["skip", "once"],
+        Loosens("raised"),
         Field(description="missed slots are recorded; skip: nothing runs for them; once: one run for all of them"),
     ] = "skip"
     needs: Needs = Needs()
     on_alarm: Annotated[
         Literal["none", "propose"],
+        Loosens("raised"),
         Field(
             description="propose: when a check raises an alarm, the service measures the [alarm] campaign, solves and searches it, and "
             "proposes tables, which wait for approval"

@@ -9,9 +9,13 @@ import json
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from datetime import date
+from types import NoneType, UnionType
+from typing import Any, Literal, Union, get_args, get_origin, get_type_hints
 
+from abbe.service.config_schema import Calibration, Limits, Verify
 from abbe.service.domain.machine_file import FileEdit, MachineFileSummary
+from abbe.service.domain.schedule import Needs, Schedule
 from abbe.service.web.frame import current
 
 Kind = Literal["text", "optional", "number", "maybe", "yes", "date", "range", "choice", "many", "times"]
@@ -40,6 +44,25 @@ def _fields(section: str, **kinds: Kind) -> tuple[Field, ...]:
     return tuple(Field(f"{section}.{name}", kind) for name, kind in kinds.items())
 
 
+def _every(section: str, table: type, *, only: Sequence[str] = (), but: Sequence[str] = ()) -> tuple[Field, ...]:
+    """A field for each key of a table of the machine file, or for some of them; the type of the key decides how it is shown."""
+    hints = get_type_hints(table)
+    return tuple(_of_type(f"{section}.{key}".lstrip("."), hints[key]) for key in only or hints if key not in but and key != "model_config")
+
+
+def _of_type(key: str, hint: Any) -> Field:
+    inner = [one for one in get_args(hint) if one is not NoneType] if get_origin(hint) in (Union, UnionType) else [hint]
+    absent, kind = inner != [hint], inner[0]
+    if get_origin(kind) is Literal:
+        return Field(key, "choice", get_args(kind))
+    if get_origin(kind) is list:
+        return Field(key, "many", get_args(get_args(kind)[0]))
+    if get_origin(kind) is tuple:
+        return Field(key, "range")
+    kinds: dict[Any, Kind] = {bool: "yes", date: "date", str: "optional" if absent else "text"}
+    return Field(key, kinds.get(kind, "maybe" if absent else "number"))
+
+
 PLACES = ("laboratory", "customer", "laboratoryBranch", "customerBranch", "other")
 ISSUER = (
     *(Field(f"issuer.{name}", "text", required=True) for name in ("laboratory", "city", "country", "person")),
@@ -47,49 +70,20 @@ ISSUER = (
     Field("issuer.place", "choice", PLACES),
 )
 ITEM = _fields("item", maker="text", model="text", serial="text", place="text")
-VERIFY = _fields("verify", body_diagonal_um="number", helix_rms_um="number", reversal_um="maybe")
-PUSH = _fields(
-    "limits",
-    table_value_um="number",
-    table_change_um="number",
-    table_step_um="number",
-    table_beyond_percent="number",
-    table_walk_um="number",
-    measurement_age_h="number",
-    two_people="yes",
-)
-MEASURE = (
-    *_fields("limits", feed_mm_min="number", temperature_c="range", run_temperature_c="range"),
-    Field("limits.continue_after", "many", ("door", "beam", "temperature", "ballbar")),
-    *_fields("limits", suspend_s="number", settle_s="number"),
-)
-CERTIFICATES = _fields(
-    "calibration",
-    ballbar="date",
-    ballbar_is="text",
-    laser="date",
-    laser_is="text",
-    artefact="date",
-    artefact_is="text",
-    room="date",
-    room_temperature_c="range",
-)
+VERIFY = _every("verify", Verify)
+MEASURE = _every("limits", Limits, only=("feed_mm_min", "temperature_c", "run_temperature_c", "continue_after", "suspend_s", "settle_s"))
+PUSH = tuple(one for one in _every("limits", Limits) if one not in MEASURE)
+CERTIFICATES = _every("calibration", Calibration)
 LABORATORY, LIMITS = (*ISSUER, *ITEM), (*VERIFY, *PUSH, *MEASURE)
-SCHEDULE = (
+TIMES = (
     Field("name", "text", required=True),
     Field("recipe", "choice"),
     Field("cron", "times", (*DAYS, "expression", "interval")),
     Field("every_h", "maybe"),
     Field("first", "optional"),
     Field("timezone", "text", required=True),
-    Field("grace_s", "number"),
-    Field("catch_up", "choice", ("skip", "once")),
-    Field("on_alarm", "choice", ("none", "propose")),
-    Field("needs.idle", "yes"),
-    Field("needs.warm_min", "number"),
-    Field("needs.air", "yes"),
-    Field("needs.operator", "choice", ("any", "present", "absent")),
 )
+SCHEDULE = (*TIMES, *_every("", Schedule, but=[one.key for one in TIMES] + ["needs"]), *_every("needs", Needs))
 """Fields of one schedule; their keys follow ``schedule[N].``."""
 SCHEDULE_DEFAULTS = {"timezone": "UTC", "recipe": "quick-check", "catch_up": "skip", "on_alarm": "none", "needs.operator": "any"}
 
