@@ -92,7 +92,8 @@ class Effect:
         the stated strength includes this part.
     kind : "mean" | "variance"
         Whether the effect shifts the readings or adds noise (stick-slip, vibration with an unknown phase, outliers). The columns of a
-        "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative.
+        "variance" effect are the extra variance of each reading, mm^2 per unit, and never negative. The search has a test of its own for
+        each effect of this kind, so an effect from outside is of the kind "mean".
     one_sign : bool
         Whether all coefficients have the same sign, positive or negative: the set-ups share the law of the error, not its size.
     absorbed_by : tuple of str

@@ -142,7 +142,8 @@ class CandidateContext:
     machine, machine_mark : str
         Name; mark that changes when older measurements no longer hold (the boot ids of the controller).
     map_version, lsb_nm, bank_registers : int
-        Register map, unit of a table's values and size of a bank, as the controller states them.
+        Register map of this program, as a controller with another one is refused at its connection; unit of a table's values and size of a
+        bank, as the controller states them.
     travel_mm : dict
         Axis -> (lowest, highest) position.
     grid_mm : dict

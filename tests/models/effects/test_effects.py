@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -49,6 +50,11 @@ def test_an_effect_is_declared_and_behaves(effect: Effect) -> None:
     assert declaration_faults(effect) == ()
     assert signal_faults(effect, PATHS) == ()
     assert effect.unit == STRENGTH_UNITS.get(effect.name, "um")  # run-format.md 5
+
+
+def test_an_effect_from_outside_that_adds_scatter_is_refused_as_nothing_searches_for_it() -> None:
+    (fault,) = declaration_faults(replace(BY_NAME["stick_slip"], name="shop_scatter"))
+    assert fault.startswith("kind 'variance': expected mean")
 
 
 def test_the_names_are_those_of_the_exchange_format() -> None:
