@@ -10,11 +10,10 @@ from typing import Any
 from abbe.models.machine import Machine
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.machine import AxisMaterial, DeviceUrls, Rules, machine_from_doc
-from abbe.service.domain.machine_file import CaptureSettings
+from abbe.service.domain.machine_file import CaptureSettings, NcSettings
 from abbe.service.errors import TableRefused
 from abbe.service.push.validate import PushLimits
 from abbe.service.sequences.control import Suspending, Watching
-from abbe.service.sequences.nc.write import NcSettings
 
 
 @dataclass(frozen=True, slots=True)

@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import scipy
@@ -23,10 +24,10 @@ from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import DIAGONALS, diagonal_ends
-from abbe.models.solvers.joint import JointSolution
-from abbe.models.solvers.priors import U_WAVELENGTH
-from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.sources import ErrorSources, error_sources, variances
+
+if TYPE_CHECKING:
+    from abbe.models.solvers.joint import JointSolution
+    from abbe.models.uncertainty.sources import ErrorSources
 
 DIAGONAL_WEIGHT = 1.0
 """Weight of the four body diagonals together; the volume has weight 1."""
@@ -151,6 +152,10 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
     scales and includes all other sources (`abbe.models.uncertainty.sources`). One of these is the laser's wavelength: an unknown
     (`laser_scale`) if a laser was used, otherwise an assumed uncertainty of the reference length.
     """
+    from abbe.models.solvers.priors import U_WAVELENGTH
+    from abbe.models.uncertainty.inputs import StatedInputs
+    from abbe.models.uncertainty.sources import error_sources
+
     sources = error_sources(solution, replace(StatedInputs().as_measured(), u_wavelength=0.0))  # ``common`` holds the wavelength
     slopes = {}
     for a in range(3):
@@ -166,5 +171,7 @@ def mean_linear(solution: JointSolution, *, positions: int = 41, nodes: int = 9)
 
 def mean_parameter(sources: ErrorSources, name: str, gradient: F1, u_common: float = 0.0) -> MeanParameter:
     """Return the parameter ``gradient @ coefficients`` with its uncertainty from all sources and from ``u_common``, in quadrature."""
+    from abbe.models.uncertainty.sources import variances
+
     u = float(np.sqrt(variances(sources, gradient[None])[0]))
     return MeanParameter(name, float(gradient @ sources.coefficients), float(np.hypot(u, u_common)))

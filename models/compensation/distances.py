@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -14,8 +15,10 @@ from abbe.models.arrays import F1, F2
 from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
 from abbe.models.machine import Machine
-from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.sources import ErrorSources, approach_variance_mm2, error_sources, joint_factor
+
+if TYPE_CHECKING:
+    from abbe.models.solvers.joint import JointSolution
+    from abbe.models.uncertainty.sources import ErrorSources
 
 Correction = Callable[[F2], F2]
 """Function of commanded positions (n, 3), mm, that returns the corrections to be added to them, shape (n, 3), mm."""
@@ -131,6 +134,8 @@ def predict_distances(
     draws : int
         Number of random draws of the field, with a fixed seed.
     """
+    from abbe.models.uncertainty.sources import approach_variance_mm2, error_sources, joint_factor
+
     pairs = pairs or random_pairs(inner_box_mm(solution.machine))
     sources = sources or error_sources(solution)
     a = pair_design(solution.machine, sources.terms, pairs)

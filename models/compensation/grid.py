@@ -7,6 +7,7 @@ constant keeps the reference node in place, because a controller's reference poi
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +17,12 @@ from abbe.models.compensation.distances import Pairs, random_pairs
 from abbe.models.compensation.tables import check_unit, grid_positions
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import RigidFree, rigid_design
-from abbe.models.solvers.joint import JointSolution
-from abbe.models.uncertainty.inputs import StatedInputs
-from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation, unobserved_mm
-from abbe.models.uncertainty.scales import Scales, scale_projection, without_scales
-from abbe.models.uncertainty.sources import ErrorSources, error_sources
+
+if TYPE_CHECKING:
+    from abbe.models.solvers.joint import JointSolution
+    from abbe.models.uncertainty.inputs import StatedInputs
+    from abbe.models.uncertainty.scales import Scales
+    from abbe.models.uncertainty.sources import ErrorSources
 
 FIT_SAMPLES = 5
 """Samples per cell for the fit of a function; with these, the fit of a parabola is within 2 % of the continuous fit."""
@@ -228,6 +230,9 @@ def grid_table(
     ValueError
         Fewer than 2 nodes on an axis, a mask of another shape, or a reference outside the grid.
     """
+    from abbe.models.uncertainty.prediction import predict_deviation
+    from abbe.models.uncertainty.sources import error_sources
+
     position = grid_positions(solution.machine, counts)
     keep = np.ones(counts, dtype=bool) if compensable is None else np.asarray(compensable, dtype=bool)
     if keep.shape != counts:
@@ -255,6 +260,10 @@ def compensable_nodes(
     error that no reading shows may exceed the deviation (`abbe.models.uncertainty.prediction`). ``scales``: scale errors to leave out of
     the uncertainty and of this hidden error.
     """
+    from abbe.models.uncertainty.prediction import compensable_mask, predict_deviation, unobserved_mm
+    from abbe.models.uncertainty.scales import scale_projection, without_scales
+    from abbe.models.uncertainty.sources import error_sources
+
     points = nodes_mm(grid_positions(solution.machine, counts))
     frame = RigidFree(points)
     sources, projection = error_sources(solution, inputs), None

@@ -58,9 +58,9 @@ def field_mm(machine: Machine, motions: Motions, axes_mm: F2) -> F2:
     ValueError
         The shape is wrong.
     """
-    lines = grid_lines(axes_mm)
-    if lines is not None:
-        return grid_mm(machine, lines, line_motions(motions, lines)).reshape(-1, 3)
+    found = _on_grid(machine, motions, axes_mm)
+    if found is not None:
+        return found
     out: F2 = np.empty((len(axes_mm), 3))
 
     def block(rows: slice) -> None:
@@ -96,6 +96,45 @@ def in_blocks(count: int, work: Callable[[slice], None], *, weight: int = 1) -> 
 
 def grid_lines(axes_mm: F2) -> Lines | None:
     """Return the positions of X, Y and Z if the points, shape (n, 3), are exactly a full grid with X slowest and Z fastest, else None."""
+    lines = _edges(axes_mm)
+    if lines is None:
+        return None
+    count, same = _comparison(axes_mm, lines)
+    return lines if _in_parts(count, same, len(axes_mm)) else None
+
+
+def _on_grid(machine: Machine, motions: Motions, axes_mm: F2) -> F2 | None:
+    """Return `field_mm` of a full grid, None for other points: what is computed while the points are compared is then left.
+
+    So the threads are started once, and none waits for the other between the two parts.
+    """
+    lines = _edges(axes_mm)
+    if lines is None:
+        return None
+    (compared, same), (computed, fill, out) = _comparison(axes_mm, lines), _product(machine, lines, line_motions(motions, lines))
+
+    def part(k: int) -> bool:
+        return same(k) if k < compared else fill(k - compared)
+
+    return out.reshape(-1, 3) if _in_parts(compared + computed, part, 2 * len(axes_mm)) else None
+
+
+def _in_parts(count: int, work: Callable[[int], bool], points: int) -> bool:
+    """Call ``work`` for ``count`` parts of equal size, shared by threads, until one returns False; return whether none did."""
+    failed: list[int] = []
+
+    def some(parts: slice) -> None:
+        for k in range(parts.start, parts.stop):
+            if failed or not work(k):
+                failed.append(k)
+                return
+
+    in_blocks(count, some, weight=max(BLOCK, -(-points // count)))
+    return not failed
+
+
+def _edges(axes_mm: F2) -> Lines | None:
+    """Return the lines of the full grid that the points can only be, by three of their edges; None if they can be none."""
     count = len(axes_mm)
     if count < LEAST or axes_mm.shape[1:] != (3,):
         return None
@@ -104,21 +143,24 @@ def grid_lines(axes_mm: F2) -> Lines | None:
     if min(nz, ny) < 2 or count % (nz * ny):
         return None
     grid = np.asarray(axes_mm).reshape(-1, ny, nz, 3)
-    lines = grid[:, 0, 0, 0].copy(), grid[0, :, 0, 1].copy(), grid[0, 0, :, 2].copy()
-    stretch = -(-len(grid) // (4 * CORES))
-    differing: list[int] = []
+    return grid[:, 0, 0, 0].copy(), grid[0, :, 0, 1].copy(), grid[0, 0, :, 2].copy()
 
-    def planes(stretches: slice) -> None:
+
+def _comparison(axes_mm: F2, lines: Lines) -> tuple[int, Callable[[int], bool]]:
+    """Return a number of parts, and the function that compares one part of the points with the grid of the lines."""
+    grid = np.asarray(axes_mm).reshape(*(line.size for line in lines), 3)
+    stretch = -(-len(grid) // (4 * CORES))
+
+    def same(k: int) -> bool:
         plane = np.empty(grid.shape[1:])  # once for many planes: to fill it costs more than to compare
         plane[..., 1], plane[..., 2] = lines[1][:, None], lines[2]
-        for k in range(stretches.start * stretch, min(stretches.stop * stretch, len(grid))):
-            plane[..., 0] = lines[0][k]
-            if differing or not (grid[k] == plane).all():
-                differing.append(k)
-                return
+        for i in range(k * stretch, min((k + 1) * stretch, len(grid))):
+            plane[..., 0] = lines[0][i]
+            if not (grid[i] == plane).all():
+                return False
+        return True
 
-    in_blocks(-(-len(grid) // stretch), planes, weight=stretch * ny * nz)
-    return None if differing else lines
+    return -(-len(grid) // stretch), same
 
 
 def line_motions(motions: Motions, lines: Lines) -> tuple[F2, F2, F2]:
@@ -131,36 +173,30 @@ def line_motions(motions: Motions, lines: Lines) -> tuple[F2, F2, F2]:
     return x, y, z
 
 
-def grid_mm(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> F4:
-    """Return the deviation on the full grid of three lines of positions, which need be neither even nor sorted.
+def _product(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> tuple[int, Callable[[int], bool], F4]:
+    """Return a number of parts, the function that computes one of them (True), and the deviation that they fill, shape (nx, ny, nz, 3), mm.
 
-    Parameters
-    ----------
-    lines : three arrays, shape (nx,), (ny,), (nz,)
-        Commanded positions of X, Y and Z.
-    motions : three arrays, shape (nx, 6), (ny, 6), (nz, 6)
-        EX EY EZ (mm, squareness included) and EA EB EC (rad) of the X, Y and Z carriage there, ISO signs.
-
-    Returns
-    -------
-    array, shape (nx, ny, nz, 3)
-        Actual minus nominal, tool relative to workpiece, mm.
+    ``motions``: EX EY EZ (mm, squareness included) and EA EB EC (rad) of each carriage along its line, shape (n_axis, 6). The lines need
+    be neither even nor sorted.
     """
     nx, ny, nz = (line.size for line in lines)
     out: F4 = np.empty((nx, ny, nz, 3))
     moved = [_own(machine, a, lines[a], motions[a]) for a in range(3)]
     of_x = np.concatenate([np.ones((nx, 1)), lines[0][:, None], moved[0], motions[0][:, 3:]], axis=1)
-    of_yz = _plane(lever_masks(machine.chain), lines, moved, motions).reshape(8, -1)
-    flat, down = out.reshape(nx, -1), -(-nx // TILE[0])
+    masks, flat, rows = lever_masks(machine.chain), out.reshape(nx, -1), max(1, TILE[1] // (3 * nz))
 
-    def tiles(some: slice) -> None:
-        for k in range(some.start, some.stop):
-            i, j = k % down * TILE[0], k // down * TILE[1]  # what a column of tiles shares stays in the cache
-            rows, columns = slice(i, i + TILE[0]), slice(j, j + TILE[1])
-            np.matmul(of_x[rows], of_yz[:, columns], out=flat[rows, columns])
+    def fill(k: int) -> bool:
+        some = slice(k * rows, (k + 1) * rows)
+        y = lines[0], lines[1][some], lines[2]
+        of_yz = _plane(masks, y, [moved[0], moved[1][some], moved[2]], (motions[0], motions[1][some], motions[2])).reshape(8, -1)
+        here = flat[:, some.start * 3 * nz : some.start * 3 * nz + of_yz.shape[1]]
+        for j in range(0, of_yz.shape[1], TILE[1]):
+            for i in range(0, nx, TILE[0]):
+                tile = slice(i, i + TILE[0]), slice(j, j + TILE[1])
+                np.matmul(of_x[tile[0]], of_yz[:, tile[1]], out=here[tile])
+        return True
 
-    in_blocks(down * -(-flat.shape[1] // TILE[1]), tiles, weight=TILE[0] * TILE[1] // 3)
-    return out
+    return -(-ny // rows), fill, out
 
 
 def _own(machine: Machine, axis: int, line_mm: F1, motions: F2) -> F2:

@@ -8,7 +8,7 @@ together with the best-fit rigid motion (`abbe.models.geometry.volume`), and out
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
@@ -17,7 +17,9 @@ from abbe.models.geometry.bases import Term
 from abbe.models.geometry.chain import design
 from abbe.models.geometry.volume import rigid_design, volume_grid
 from abbe.models.machine import AXES, Machine
-from abbe.models.uncertainty.sources import ErrorSources
+
+if TYPE_CHECKING:
+    from abbe.models.uncertainty.sources import ErrorSources
 
 Scales = Literal["common", "axes"]
 """The common scale of all axes, or the scale of each axis."""

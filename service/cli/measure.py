@@ -296,10 +296,13 @@ def say_correction(found: Correction, hints: list[str], machine: Path | None, *,
 
 def checking_poses(site: Site, check: Path | None) -> CampaignPlan | None:
     """Return the poses of an artefact in a recipe that verify a table in place of diagonals and a helix; None without a recipe."""
+    if check is None:
+        return None
+
     from abbe.service.sequences.recipes.artefact import verifying_poses
     from abbe.service.sequences.recipes.recipe_file import read_recipe
 
-    return None if check is None else verifying_poses(site.machine, *read_recipe(check))
+    return verifying_poses(site.machine, *read_recipe(check))
 
 
 async def verification_before(context: PushContext, campaign: str) -> list[Run]:

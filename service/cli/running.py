@@ -9,6 +9,7 @@ import signal
 import sys
 from collections.abc import Callable, Coroutine, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
+from importlib import import_module
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -70,6 +71,12 @@ def run_job(job: Coroutine[Any, Any, T], control: Control | None = None) -> T:
             for text in getattr(error, "__notes__", []):
                 sys.stderr.write(f"stopped: {text}\n")
         raise SystemExit(128 + received[0]) from None
+
+
+async def loaded_beside(*modules: str) -> None:
+    """Import modules in another thread, while open links go on: for what a command needs only once the devices have answered."""
+    for name in modules:
+        await asyncio.to_thread(import_module, name)
 
 
 async def _cancelled_by_signal(job: Coroutine[Any, Any, T], received: list[int], control: Control | None) -> T:

@@ -35,7 +35,6 @@ from abbe.service.formats.registry import FORMATS, format_of
 from abbe.service.signed import keys
 from abbe.service.signed.container import LARGEST, NO_BASE, Claims, ExpectedContent, check, claims_of, sign
 from abbe.service.site import site_of
-from abbe.service.verification.reduction import UNKNOWN
 
 LARGEST_FILE, LARGEST_SOLUTION = 20_000_000, 512 << 20
 BEYOND = 0.1
@@ -209,7 +208,7 @@ def export(
     reference_mm: F1 | None = None,
     *,
     fresh: bool = False,
-    holds_at: str = UNKNOWN,
+    holds_at: str = "",
     turned: bool | None = None,
 ) -> Exported:
     """Return the files of the tables that best correct the machine, of all kinds that a control or format can hold.
@@ -223,7 +222,7 @@ def export(
     fresh : bool
         No correction was in force while the machine was measured (`abbe.service.tables.measured_with`).
     holds_at : str
-        Temperature of the scales at which the solution holds.
+        Temperature of the scales at which the solution holds; empty: unknown.
     turned : bool, optional
         Result of the 10 µm step (`sign_is_turned`). It is used only if no manual states the sign of the format.
 
@@ -232,6 +231,8 @@ def export(
     FormatRefused
         There is no such format, the tables do not fit it, or no table reduces the errors.
     """
+    from abbe.service.verification.reduction import UNKNOWN
+
     control = control_for(key)
     reference = known.machine.stroke_mm[:, 0] if reference_mm is None else reference_mm
     found = choices(known, control, reference)
@@ -239,7 +240,7 @@ def export(
     if best.rms_mm >= found[0].rms_mm:
         raise FormatRefused(f"no kind of table of {control.name} reduces the errors", "the machine needs none; nothing was written")
     files = files_of(best.compensation, control, settings_for(control, known.machine, reference), turned=turned or False)
-    return Exported(files, found, (f"holds at: {holds_at}", *_notes(best.compensation, control, fresh=fresh, turned=turned)))
+    return Exported(files, found, (f"holds at: {holds_at or UNKNOWN}", *_notes(best.compensation, control, fresh=fresh, turned=turned)))
 
 
 def files_of(comp: Compensation, control: ControlModel, settings: FormatSettings, *, turned: bool = False) -> tuple[TextFile, ...]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from dataclasses import dataclass, is_dataclass, replace
+from collections.abc import Mapping
+from dataclasses import dataclass, field, is_dataclass, replace
 from typing import Annotated, Literal, get_type_hints
 
 from pydantic import Field
@@ -104,3 +105,21 @@ class CaptureSettings:
     folder: str = ""
     reserve_bytes: int = 16 << 20
     keep: bool = False
+
+
+USUAL_MEMORY_KIB: Mapping[str, float] = {"fanuc": 256.0, "iso": 256.0}
+"""Program memory by dialect, for controls without a disk of their own, if the machine file gives none."""
+
+
+@dataclass(frozen=True, slots=True)
+class NcSettings:
+    """``[nc]`` of the machine file: acceleration along the path, row of the tool table for the holder in the spindle (None: the operator
+    writes it), and program memory by dialect."""
+
+    acceleration_mm_s2: float = 500.0
+    heidenhain_tool: int | None = None
+    memory_kib: Mapping[str, float] = field(default_factory=dict)
+
+    def memory_of(self, dialect: str) -> float | None:
+        """Return the program memory in KiB; None: no relevant limit."""
+        return self.memory_kib.get(dialect, USUAL_MEMORY_KIB.get(dialect))

@@ -7,15 +7,15 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from datetime import UTC, datetime
-from typing import Any
-
-from cryptography.exceptions import InvalidSignature
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey, Ed25519PublicKey
+from typing import TYPE_CHECKING, Any
 
 from abbe.service.clock import utc_text
 from abbe.service.domain.document import canonical
 from abbe.service.errors import SignatureRefused
 from abbe.service.signed.keys import public_of
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 FORM = "abbe-signed/1"
 PURPOSE = b"abbe compensation files\x00"
@@ -78,6 +78,9 @@ def check(sealed: bytes, files: Mapping[str, bytes], expected: ExpectedContent, 
         The files differ from the signed ones, the key is not trusted, the claims are for another machine, base, limits or format, or they
         have expired.
     """
+    from cryptography.exceptions import InvalidSignature
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PublicKey
+
     key, claims, signature = _parts(sealed)
     if key not in expected.trusted:
         raise SignatureRefused(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-
-from cryptography.exceptions import UnsupportedAlgorithm
-from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
-from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat, load_pem_private_key
+from typing import TYPE_CHECKING
 
 from abbe.service.errors import KeyRefused
+
+if TYPE_CHECKING:
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
 
 
 def new_key(path: Path) -> str:
@@ -20,6 +20,9 @@ def new_key(path: Path) -> str:
     KeyRefused
         The file exists or cannot be written.
     """
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import Encoding, NoEncryption, PrivateFormat
+
     key = Ed25519PrivateKey.generate()
     text = key.private_bytes(Encoding.PEM, PrivateFormat.PKCS8, NoEncryption())
     try:
@@ -44,6 +47,10 @@ def read_key(path: Path) -> Ed25519PrivateKey:
     KeyRefused
         The file cannot be read, is not an Ed25519 key, or is readable by others.
     """
+    from cryptography.exceptions import UnsupportedAlgorithm
+    from cryptography.hazmat.primitives.asymmetric.ed25519 import Ed25519PrivateKey
+    from cryptography.hazmat.primitives.serialization import load_pem_private_key
+
     try:
         if os.name == "posix" and path.stat().st_mode & 0o077:
             raise KeyRefused(f"{path}: others may read this key", f"chmod 600 {path}, or make a new key if others may have read it")

@@ -14,6 +14,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import fields, is_dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
+from functools import cached_property
 from typing import TYPE_CHECKING, Any, Generic, ParamSpec, Self, TypeVar, get_type_hints
 
 from sqlalchemy import Column, ColumnElement, Connection, Engine, FromClause, Row, Select, Table, func, insert, null, select, text
@@ -167,21 +168,31 @@ class RecordMapping(Generic[R]):
     ) -> None:
         assert is_dataclass(record)
         self.table, self._source = table, table if source is None else source
-        self._make: Callable[..., R] = record
+        self._make: type[R] = record
         self._prefix = f"{table.name}_{record.__name__}_"
-        names = [one.name for one in fields(record)]
+        names, self._by_name = [one.name for one in fields(record)], any(one.kw_only for one in fields(record))
         if missing := [name for name in names if name not in other and name not in table.c]:
             raise TypeError(f"{record.__name__}: table {table.name} has no column {', '.join(missing)}")
         self._fields = {name: other[name] if name in other else table.c[name] for name in names}
-        kinds = get_type_hints(record)
-        self._enums = {name: kind for name, kind in kinds.items() if isinstance(kind, type) and issubclass(kind, StrEnum)}
         self._nested = {name: column for name, column in self._fields.items() if isinstance(column, RecordMapping)}
         self._labels = {name: self._prefix + name for name in names if name not in self._nested}
-        self._documents = {
-            name: kind for name, kind in kinds.items() if isinstance(kind, type) and is_dataclass(kind) and name not in self._nested
-        }
 
-        self._plain = not (self._nested or self._enums or self._documents or any(one.kw_only for one in fields(record)))
+    @cached_property
+    def _kinds(self) -> dict[str, type]:
+        """Fields whose type is a class; found at the first use, since a command reads few of the tables."""
+        return {name: kind for name, kind in get_type_hints(self._make).items() if isinstance(kind, type)}
+
+    @cached_property
+    def _enums(self) -> dict[str, type[StrEnum]]:
+        return {name: kind for name, kind in self._kinds.items() if issubclass(kind, StrEnum)}
+
+    @cached_property
+    def _documents(self) -> dict[str, type]:
+        return {name: kind for name, kind in self._kinds.items() if is_dataclass(kind) and name not in self._nested}
+
+    @cached_property
+    def _plain(self) -> bool:
+        return not (self._nested or self._enums or self._documents or self._by_name)
 
     @property
     def columns(self) -> list[ColumnElement[Any]]:

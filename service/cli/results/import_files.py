@@ -78,6 +78,9 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     database. Without a terminal and without --yes the preview is printed, nothing is stored, and the exit code is 1.
     """
     check_inputs(*files)
+    if len(files) == 1 and files[0].is_dir():
+        _import_folder(files[0], db, machine, as_json=as_json)
+        return
 
     from abbe.service.instrument_files.answers import Answers
     from abbe.service.instrument_files.point_list import is_point_list
@@ -86,7 +89,7 @@ def import_files(  # noqa: PLR0913 - one argument for each option
     if all(is_point_list(path) for path in files):
         _import_points(files, name or files[0].stem, (db, machine), as_json=as_json)
         return
-    if len(files) == 1 and (files[0].is_dir() or not files[0].suffix):
+    if len(files) == 1 and not files[0].suffix:  # it says what a campaign folder is
         _import_folder(files[0], db, machine, as_json=as_json)
         return
     answers = Answers(

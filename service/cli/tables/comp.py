@@ -109,15 +109,12 @@ def export_tables(  # noqa: PLR0913 - one argument for each option
         sign_is_turned,
         write_files,
     )
-    from abbe.service.verification.reduction import UNKNOWN
 
     known = identified(doc, without_scale=without_scale)
     seal = None if sign is None else TableSeal(sign, days, base)
     config = None if seal is None else check_signing(doc, _machine_file(machine), seal)
     fresh = _fresh(solution, db, machine, confirmed_none=without_table)
-    made = export(
-        known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or UNKNOWN, turned=sign_is_turned(step_moved)
-    )
+    made = export(known, form, reference_of(reference), fresh=fresh, holds_at=doc.get("holds_at") or "", turned=sign_is_turned(step_moved))
     notes = [*made.notes, *scale_note(doc, without_scale=without_scale), *reach_note(doc)]
     written = [str(p) for p in write_files(made.files, out, folder=len(formats_in(control_for(form))) > 1)]
     if seal is not None and config is not None:

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from abbe.service.compensation.commission import SignCommissioning
     from abbe.service.compensation.commission_levels import ProvedLevels
     from abbe.service.compensation.correct import Correction
+    from abbe.service.compensation.rollback import RollbackResult
     from abbe.service.storage.store import Store
 
 
@@ -37,9 +38,7 @@ def push(
     as_json: JsonOption = False,
 ) -> None:
     """Push a proposal, test the signs of its tables, measure again; roll back if the machine is not better (exit code 1)."""
-    from abbe.service.cli.running import display, rollback_when_safe, run_job
-    from abbe.service.compensation.correct import push as work_push
-    from abbe.service.compensation.gate import PushContext, admit
+    from abbe.service.cli.running import display, loaded_beside, rollback_when_safe, run_job
     from abbe.service.config import load_machine
     from abbe.service.errors import TableRefused
     from abbe.service.site import site_of
@@ -51,8 +50,12 @@ def push(
     hints: list[str] = []
 
     async def work(store: Store) -> Correction:
-        with display() as sink:
-            async with ready_session(store, site, accept_table=accept_table) as session:
+        async with ready_session(store, site, accept_table=accept_table) as session:
+            await loaded_beside("abbe.service.compensation.correct")
+            from abbe.service.compensation.correct import push as work_push
+            from abbe.service.compensation.gate import PushContext, admit
+
+            with display() as sink:
                 context = PushContext(session, store, site, sink, poses=poses)
                 admission = await admit(context, proposal)
                 hints.append(admission.hint)
@@ -89,9 +92,7 @@ def rollback(
     """Restore the table that was in force before the last kept push: on a person's order, without measuring. Asks first."""
     from dataclasses import replace
 
-    from abbe.service.cli.running import run_job
-    from abbe.service.compensation.rollback import RollbackResult
-    from abbe.service.compensation.rollback import rollback as work_rollback
+    from abbe.service.cli.running import loaded_beside, run_job
     from abbe.service.config import load_machine
     from abbe.service.devices.session import DeviceUrls
     from abbe.service.domain.push_entry import TERMINAL
@@ -111,6 +112,9 @@ def rollback(
         async with ready_session(store, replace(site, urls=DeviceUrls(site.urls.cnc))) as session:
             if finished and to is None:
                 return f"push {last[0].push} was unfinished and is ended now; to go further back, run the command again"
+            await loaded_beside("abbe.service.compensation.rollback")
+            from abbe.service.compensation.rollback import rollback as work_rollback
+
             return await work_rollback(session.controller, store, site, to)
 
     with Store.open(loaded.database_url) as store:
@@ -122,7 +126,7 @@ def rollback(
     else:
         lines = [f"the table is in force again (push {found.pushed.push_id}, CRC {found.pushed.crc:08X}): {found.how}"]
         lines += [f"the machine is unverified now: {measure_now(loaded.path)}"]
-    push_id = found.pushed.push_id if isinstance(found, RollbackResult) else None
+    push_id = None if found is None or isinstance(found, str) else found.pushed.push_id
     answer({"push": push_id, "text": "; ".join(lines)}, *lines, as_json=as_json)
     conclude(measure_now(loaded.path), as_json=as_json)
 
@@ -197,11 +201,7 @@ def commission(
 
     This proves which pushes the controller is safe for (its level), and sign, axis and unit of its tables. Exit code 1: not all is proved.
     """
-    from abbe.service.cli.running import display, rollback_when_safe, run_job
-    from abbe.service.compensation.commission import commission as work_commission
-    from abbe.service.compensation.commission_levels import commission_levels
-    from abbe.service.compensation.commission_one_bank import commission_one_bank
-    from abbe.service.compensation.proved_levels import check_level
+    from abbe.service.cli.running import display, loaded_beside, rollback_when_safe, run_job
     from abbe.service.config import load_machine
     from abbe.service.site import site_of
     from abbe.service.storage.store import Store
@@ -211,6 +211,14 @@ def commission(
 
     async def work(store: Store) -> tuple[ProvedLevels, SignCommissioning | None]:
         async with ready_session(store, site, accept_table=accept_table) as session:
+            await loaded_beside(
+                *(f"abbe.service.compensation.{name}" for name in ("commission", "commission_levels", "commission_one_bank"))
+            )
+            from abbe.service.compensation.commission import commission as work_commission
+            from abbe.service.compensation.commission_levels import commission_levels
+            from abbe.service.compensation.commission_one_bank import commission_one_bank
+            from abbe.service.compensation.proved_levels import check_level
+
             levels = await (commission_one_bank if one_bank else commission_levels)(session.controller, store, site)
             if not as_json:
                 _show_levels(levels)

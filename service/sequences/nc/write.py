@@ -3,35 +3,17 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from abbe.models.machine import AXES, Machine
 from abbe.models.paths import PLANES
 from abbe.service.domain.machine import Point
+from abbe.service.domain.machine_file import NcSettings
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.nc.blocks import Arc, Block, Comment, Dwell, Go, Halt, Program, Smooth, program
 from abbe.service.sequences.steps import CampaignPlan
-
-USUAL_MEMORY_KIB: Mapping[str, float] = {"fanuc": 256.0, "iso": 256.0}
-"""Program memory by dialect, for controls without a disk of their own, if the machine file gives none."""
-
-
-@dataclass(frozen=True, slots=True)
-class NcSettings:
-    """``[nc]`` of the machine file: acceleration along the path, row of the tool table for the holder in the spindle (None: the operator
-    writes it), and program memory by dialect."""
-
-    acceleration_mm_s2: float = 500.0
-    heidenhain_tool: int | None = None
-    memory_kib: Mapping[str, float] = field(default_factory=dict)
-
-    def memory_of(self, dialect: str) -> float | None:
-        """Return the program memory in KiB; None: no relevant limit."""
-        return self.memory_kib.get(dialect, USUAL_MEMORY_KIB.get(dialect))
-
 
 LAST_NUMBER = 999
 """Number of blocks after which the block numbers restart (N10 to N9990): old controllers take four digits."""

@@ -12,7 +12,6 @@ from dataclasses import KW_ONLY, dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
-import scipy
 from pydantic import Field as Limits
 
 from abbe.models.machine import Machine
@@ -66,7 +65,9 @@ class ArtefactTest(TestRecipe):
 
     def matrix(self) -> Array:
         """Columns: the artefact's axes in machine axes."""
-        turn = scipy.spatial.transform.Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
+        from scipy.spatial.transform import Rotation
+
+        turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
         found: Array = np.round(turn.as_matrix(), 12) + 0.0
         return found
 

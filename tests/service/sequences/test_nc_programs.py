@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from abbe.models.machine import Machine
+from abbe.service.domain.machine_file import NcSettings
 from abbe.service.errors import ConfigError
 from abbe.service.sequences.nc.blocks import Arc, Dwell, Go, Smooth
-from abbe.service.sequences.nc.write import NAMES, NcSettings, PathDynamics, nc_program, one_move_s, runtime
+from abbe.service.sequences.nc.write import NAMES, PathDynamics, nc_program, one_move_s, runtime
 from abbe.service.sequences.recipes.recipe import Circle, Diagonal, FaceDiagonal, Helix, HelixPoints, Linear
 from abbe.service.sequences.recipes.recipe_file import shared_setups
 from abbe.service.sequences.steps import (
