@@ -5,25 +5,18 @@ its URL scheme (docs/how-to/own-device.md)::
 
     [project.entry-points."abbe.drivers"]
     "acme+tcp" = "acme_driver:DRIVER"      # DRIVER = {"cnc": open_controller}; async def open_controller(url: str) -> Controller
+
+A driver is imported with its first device: a command waits only for the drivers that its machine has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
 from importlib.metadata import EntryPoint
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture, OneBank, Tables, has_one_table
-from abbe.drivers.ballbar.driver import SerialBallBar
-from abbe.drivers.cnc.driver import ModbusController
-from abbe.drivers.described.control import ListenedControl
-from abbe.drivers.described.opening import open_control, open_meter
-from abbe.drivers.described.tested import Ability, check_tested
 from abbe.drivers.errors import BadUrl, NotProved
-from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
-from abbe.drivers.laser.driver import ModbusLaser
-from abbe.drivers.links.modbus_link import Canary, ModbusLink
-from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import (
     FixtureConsoleUrl,
     FixtureTcpUrl,
@@ -36,7 +29,10 @@ from abbe.drivers.links.urls import (
     parse_url,
     split_report,
 )
-from abbe.drivers.one_bank import OneBankTables
+
+if TYPE_CHECKING:
+    from abbe.drivers.fixture.driver import Ask
+    from abbe.drivers.links.modbus_link import ModbusLink
 
 HEARTBEAT_S = 1.0
 """Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
@@ -57,6 +53,10 @@ async def open_ballbar(url: str) -> BallBar:
     parsed = parse_url(url)
     if not isinstance(parsed, SerialUrl | SocketUrl):
         raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
+
+    from abbe.drivers.ballbar.driver import SerialBallBar
+    from abbe.drivers.links.serial_link import ByteLink
+
     ballbar = SerialBallBar(ByteLink(parsed))
     await _identify_or_close(ballbar)
     return ballbar
@@ -79,7 +79,13 @@ async def open_laser(url: str) -> DisplacementMeter:
     if (entry := installed(url)) is not None:
         return cast(DisplacementMeter, await _opened(entry, "laser", url))
     if described_by(parsed := parse_url(url)):
+        from abbe.drivers.described.opening import open_meter
+        from abbe.drivers.described.tested import Ability
+
         return await open_meter(parsed, needed=Ability.DWELL)
+
+    from abbe.drivers.laser.driver import ModbusLaser
+
     laser = ModbusLaser(await _modbus(url, "a laser"))
     await _identify_or_close(laser)
     return laser
@@ -100,11 +106,18 @@ async def open_controller(url: str) -> Controller:
         Communication failed.
     """
     if (entry := installed(url)) is not None:
+        from abbe.drivers.one_bank import OneBankTables
+
         found = cast(Controller, await _opened(entry, "cnc", url))
         controller = cast(Controller, OneBankTables(cast(OneBank, found))) if has_one_table(found) else found
     elif described_by(parsed := parse_url(url)):
+        from abbe.drivers.described.opening import open_control
+        from abbe.drivers.described.tested import Ability
+
         return await open_control(parsed, needed=Ability.DWELL)
     else:
+        from abbe.drivers.cnc.driver import ModbusController
+
         controller = ModbusController(await _modbus(url, "a controller"))
     await _identify_or_close(controller)
     return controller
@@ -112,6 +125,8 @@ async def open_controller(url: str) -> Controller:
 
 def no_controller() -> Controller:
     """Return the stand-in for a control that is not connected: an operator runs the NC program, and the position is unknown."""
+    from abbe.drivers.described.control import ListenedControl
+
     return ListenedControl(None, None)
 
 
@@ -127,6 +142,8 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
     LinkDown
         No connection.
     """
+    from abbe.drivers.fixture.driver import ConsoleFixture, RemoteFixture
+
     parsed = parse_url(url)
     if isinstance(parsed, FixtureConsoleUrl):
         return ConsoleFixture(ask)
@@ -164,6 +181,8 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
             await device.close()
         raise BadUrl(ascii(url), "open device", f"the driver {entry.value} lacks {', '.join(missing)}", remedy)
     if report:
+        from abbe.drivers.described.tested import Ability, check_tested
+
         info = await _identify_or_close(device)
         try:
             check_tested(bare, report, "", info.serial_no, Ability.DWELL)
@@ -177,6 +196,9 @@ async def _modbus(url: str, what: str) -> ModbusLink:
     parsed = parse_url(url)
     if not isinstance(parsed, ModbusTcpUrl | ModbusRtuUrl):
         raise _wrong_scheme(url, what, "modbus+tcp:// or modbus+rtu://")
+
+    from abbe.drivers.links.modbus_link import Canary, ModbusLink
+
     return await ModbusLink.connect(parsed, canary=Canary(), heartbeat_s=HEARTBEAT_S)
 
 
