@@ -33,7 +33,7 @@ class DeviceInfo:
 class BarSample(NamedTuple):
     """One ball-bar sample (docs/protocols/ballbar.md). A plain tuple: thousands are made every second.
 
-    ``status``: bits of `abbe.drivers.api.BarFlag`, into which the driver of another box converts its status bits.
+    ``status``: bits of `abbe.drivers.api.BarFlag`; drivers of boxes with other status bits convert them.
     """
 
     seq: int
@@ -72,7 +72,7 @@ class BarTap(Protocol):
 class LaserReading:
     """One coherent output sample of the laser (docs/protocols/laser.md).
 
-    ``status``: bits of `abbe.drivers.api.LaserFlag`, into which the driver of another instrument converts its status bits.
+    ``status``: bits of `abbe.drivers.api.LaserFlag`; drivers of instruments with other status bits convert them.
     ``refractivity``: n - 1 of air. Values of the air that the instrument does not measure are NaN (`air_doc`).
     """
 
@@ -359,7 +359,7 @@ def only_listens(controller: Identity | Motion) -> bool:
 
 
 def resolution_mm(meter: DisplacementMeter) -> float:
-    """Smallest step of a meter's readings, mm: as in its device file, else as in docs/protocols/laser.md."""
+    """Smallest step of a meter's readings, mm: from its device file or, without a device file, from docs/protocols/laser.md."""
     return float(getattr(meter, "resolution_mm", 1e-7))
 
 

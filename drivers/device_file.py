@@ -174,11 +174,11 @@ class DeviceFile(DeviceTable):
 
     format: Literal["abbe-device/1"]
     kind: Kind
-    name: str = Field(min_length=1, max_length=80, description="what a person calls it")
+    name: str = Field(min_length=1, max_length=80, description="name of the device for people")
     source: str = Field(default="", description="manual and chapter that this file was written from")
     air: Literal["no light", "compensated", "vacuum"] = Field(
         default="no light",
-        description="of a displacement sensor: uses no light; uses light, corrected for the air; uses light, not corrected (refused)",
+        description="how a displacement sensor measures: without light; with light, corrected for the air; not corrected (refused)",
     )
     modbus: ModbusTable | None = None
     line: LineTable | None = None
@@ -223,7 +223,7 @@ class DeviceFile(DeviceTable):
             raise ValueError(f"values.{without[0]} needs an address")
         places = [(value.address or 0, SIZE[value.type]) for value in core_values(self).values()]
         if max(first + size for first, size in places) - min(first for first, _ in places) > ONE_REQUEST:
-            raise ValueError(f"the measured values, counter, time and flags lie more than {ONE_REQUEST} registers apart: not one reading")
+            raise ValueError(f"values, counter, time and flags lie more than {ONE_REQUEST} registers apart: too far for one request")
 
 
 ONE_REQUEST = 125

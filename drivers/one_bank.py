@@ -48,7 +48,7 @@ class OneBankTables:
         self.one_bank_control = control
 
     def __getattr__(self, name: str) -> Any:
-        """Everything but the tables is the control's own."""
+        """Pass everything that is not about tables on to the control."""
         return getattr(self.one_bank_control, name)
 
     async def comp_status(self) -> CompStatus:
@@ -172,4 +172,5 @@ class OneBankTables:
         conditions = (await self._c.status()).conditions
         wrong = (conditions & FORBIDDEN) | (NEEDED & ~conditions)
         if wrong:
-            raise Refused("one table", "exchange", f"not safe now; wrong state of {str(wrong.name).replace('|', ', ').lower()}")
+            states = [f"{flag.name} is {'on' if flag & conditions else 'off'}".lower() for flag in wrong]
+            raise Refused("one table", "exchange", f"not safe now: {', '.join(states)}")

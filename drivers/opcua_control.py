@@ -237,7 +237,7 @@ LOGIN = ("user", "password_file")
 
 
 def _split(url: str) -> tuple[dict[str, str], dict[str, str]]:
-    """Return the nodes of a URL, and the files and names of its session."""
+    """Return the nodes of a URL, and its keys for encryption and login; both by key."""
     query = dict(parse_qsl(urlsplit(url).query, keep_blank_values=True))
     access = {key: query.pop(key) for key in (*SECRETS, *LOGIN) if key in query}
     wrong = ""

@@ -110,7 +110,7 @@ def _correction_mm(data: bytes, number: int) -> float:
 
 def _header(data: bytes) -> int:
     if _register(data, 0) != 0xABBE or _register(data, 1) != 1:
-        raise UnreadableImage("registers 0 and 1 are not ABBE hex and 1")
+        raise UnreadableImage("registers 0 and 1 do not hold ABBE (hexadecimal) and 1, the mark of an image")
     if _register(data, 3) * 2 != len(data):
         raise UnreadableImage(f"register 3 says {_register(data, 3)} registers, there are {len(data) / 2:g}")
     kind = _register(data, 2)

@@ -203,8 +203,8 @@ class Service:
             self._publisher.wake()
 
     async def run(self, stop: asyncio.Event, *, once: bool) -> bool:
-        """Work until ``stop``, a changed machine file, or, with ``once``, until every recipe has run once; return whether all of those
-        passed."""
+        """Work until ``stop`` is set, the machine file changes or, with ``once``, every recipe has run once. Return False if a check that
+        ``once`` ran did not pass."""
         passed, end = True, self._end
         if self._opcua is not None:
             await self._opcua.prepare()
@@ -347,7 +347,7 @@ async def _main(setup: ServiceSetup, once: bool, clock: Clock, cut_off: threadin
 
 
 def _continued(setup: ServiceSetup, earlier: Readiness) -> ServiceSetup:
-    """A setup that passes on when the machine was last at work: a machine does not cool down because its file has changed."""
+    """Return a setup that keeps the record of when the machine was at work: a machine does not cool down because its file has changed."""
 
     def ready(clock: Clock) -> Readiness:
         made = setup.ready(clock)

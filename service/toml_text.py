@@ -24,12 +24,12 @@ Path = tuple[str | int, ...]
 
 
 class NotEditableError(ValueError):
-    """The text is written in a way in which this value cannot be changed alone; the message says which."""
+    """The text is written in a way in which this value cannot be changed alone; the message names its key."""
 
 
 @dataclass(frozen=True, slots=True)
 class _Statement:
-    """A header, a key with its value, a comment or an empty line. ``line``: its first, from 1; ``at``: the table that its keys are in."""
+    """A header, a key with its value, a comment or an empty line. ``line``: number of its first line, from 1; ``at``: table of its keys."""
 
     line: int
     text: str
@@ -100,7 +100,7 @@ def edited(text: str, key: str, value: Any) -> str:
     Raises
     ------
     NotEditableError
-        The text cannot be changed so.
+        This value cannot be changed alone in the text as it is written.
     """
     path = path_of(key)
     try:

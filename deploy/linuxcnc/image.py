@@ -105,7 +105,7 @@ def _parse(words: list[int]) -> _Table:
     magic, layout, kind, length, _, lsb, spare, *rest = _HEADER.unpack(data_of(words[:HEADER_WORDS]))
     counts, spare_too, start, step = tuple(rest[:3]), rest[3], tuple(rest[4:7]), tuple(rest[7:])
     if (magic, layout, lsb, spare, spare_too) != (0xABBE, 1, LSB_NM, 0, 0):
-        raise ImageError("magic, format, unit or reserved words differ")
+        raise ImageError("the header has another magic number, format, unit or reserved words than docs/protocols/cnc.md")
     sizes = {0: 0, 1: 3 * sum(counts), 2: 3 * counts[0] * counts[1] * counts[2]}
     if kind not in sizes:
         raise ImageError(f"kind {kind} is unknown")

@@ -130,8 +130,10 @@ class Box:
 class SerialBallBar:
     """A telescoping ball-bar on a serial line or a serial device server (docs/protocols/ballbar.md).
 
-    The link opens on first use, and again after a loss of the device. The driver accepts the serial number in the URL, or else the one of
-    the first box that answers, and refuses all others. ``ring_s``: capacity of the ring buffer behind the reading thread, s at 1000 Hz.
+    The link opens on first use, and again after a loss of the device. The driver accepts only the box with
+    the serial number in the URL; if the URL has none, only the first box that answers.
+
+    ``ring_s``: capacity of the ring buffer behind the reading thread, s at 1000 Hz.
     """
 
     def __init__(self, link: ByteLink, *, ring_s: float = _BUFFER_S) -> None:

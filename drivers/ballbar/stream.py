@@ -121,7 +121,7 @@ class SequenceTracker:
         return _frozen(runs)
 
     def rest(self) -> list[SampleRun]:
-        """Return the sample that is still a candidate (see `_weighed`) at the end of the stream, because no further sample follows."""
+        """Return the candidate of `_weighed`, if any, at the end of the stream: no further sample comes to judge it."""
         candidate, self._candidate = self._candidate, None
         runs: _Runs = []
         if candidate is not None:
@@ -211,7 +211,7 @@ class SequenceTracker:
         )
 
     def _weighed(self, sample: BarSample) -> tuple[BarSample, ...]:
-        """Keep a reading that jumps as a candidate until the next one shows whether it was a step or a single false value."""
+        """Hold back a reading that jumps (the candidate) until the next reading shows whether it was a step or a single false value."""
         candidate = self._candidate
         if candidate is None:
             self._candidate = sample
@@ -359,7 +359,7 @@ class Stream:
             self._batches.clear()
 
     async def get(self, timeout_s: float) -> BarBatch:
-        """Wait for the next batch; raises TimeoutError if none came, even while this computer stalled."""
+        """Wait for the next batch; raises TimeoutError if none came. A batch that arrived while this computer stalled still counts."""
         try:
             async with asyncio.timeout(timeout_s):
                 while not self._batches and self._error is None:

@@ -25,7 +25,7 @@ _LEASED = 7
 
 
 class ControllerSession:
-    """A link that verifies that its peer is the same run of the same controller."""
+    """A link that verifies that it still talks to the same controller, and that this has not restarted."""
 
     def __init__(self, link: ModbusLink) -> None:
         self.link = link

@@ -33,7 +33,7 @@ class ModbusController(Banks):
         self._commands = asyncio.Lock()  # held during numbering and acknowledge of a command, never while the axes move
 
     async def move(self, target_mm: Point, *, feed_mm_min: float, timeout_s: float) -> ControllerStatus:
-        """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return that status.
+        """Move straight to a target (commanded X, Y, Z in mm), wait until the axes stand there, and return the controller's status then.
 
         On cancellation, timeout (``timeout_s`` host seconds for the whole move) or failure while the axes move, the driver sends a feed
         hold before it raises the error.
@@ -69,7 +69,7 @@ class ModbusController(Banks):
         return None
 
     async def _moved(self, command: int, operation: str, target_mm: Point, feed_mm_min: float, timeout_s: float) -> reg.StatusBlock:
-        """Command a straight motion and return the status in which it is done."""
+        """Command a straight motion, wait until it has ended, and return the controller's status then."""
         target = self._counts(target_mm, operation)
         try:
             async with self._hold_on_trouble(), asyncio.timeout(timeout_s):
@@ -285,4 +285,4 @@ def _with_notes(error: DriverError, former: BaseException) -> DriverError:
 
 
 class _MotionStopped(DeviceFault):
-    """The controller is already in feed hold: a further request could undo a running abort."""
+    """A motion ended because the controller is in feed hold. The driver sends no further hold, which could undo a running abort."""

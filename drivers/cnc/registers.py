@@ -219,7 +219,7 @@ def decode_status(words: Sequence[int], host_s: float) -> StatusBlock:
 
 
 def bank_state(number: int) -> BankState:
-    """Convert the content of register BANK_STATE_0 or BANK_STATE_1."""
+    """Return the state of a bank from the content of register BANK_STATE_0 or BANK_STATE_1."""
     return BANK_STATES.get(number, BankState.UNKNOWN)
 
 

@@ -270,7 +270,7 @@ async def _probe_of(url: DeviceUrl, file: DeviceFile) -> DeviceUnderTest:
 
 
 async def _faults(text: str, about: Described | None, role: str) -> list[DeviceCheck]:
-    """Test the device behind a proxy, which needs its address: a serial line, or host and port."""
+    """Test the device behind a proxy. The proxy needs the device's serial line, or its host and port."""
     table = None if about is None else about.file.modbus or about.file.line
     proxy = Proxy(LATE_SHARE * (OWN_TIMEOUT_S if table is None else table.timeout_s))
     limits = None if about is None else about.file.limits

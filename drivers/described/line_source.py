@@ -73,7 +73,7 @@ class LineSource:
             await self._identity()
 
     async def _ask(self, text: str, answer: str) -> dict[str, str] | None:
-        """Send a question; return the groups of its answer, None for another answer, {} if none is expected."""
+        """Send a question; return the groups of the answer, None if the answer does not match, {} if no answer is expected."""
         if self._dirty:
             await self._silence()
         self._link.drop_input()

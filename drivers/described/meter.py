@@ -186,7 +186,8 @@ class DescribedMeter:
     def _step(self, name: str, raw: float, *, soon: bool) -> float:
         """Add the change of a count, which may wrap, to its total, and return the change.
 
-        Raises Rebooted if the count went back. ``soon``: it was read a moment ago, so a rise by more than half of its range is a step back.
+        Raises Rebooted if the count went back. ``soon``: the previous count is a moment old, so that a rise by more than half of the
+        count's range means that the count went back.
         """
         value, before = self.file.values[name], self._raw.get(name)
         step = raw if before is None else raw - before

@@ -134,8 +134,8 @@ def check_identity(device: str, counts: Mapping[str, int], map_version: int) -> 
 async def check_clock(device: str, read_us: Callable[[], Awaitable[int]]) -> None:
     """Check the order of the four registers of a device's clock. ``read_us`` returns the time since the device was switched on, us.
 
-    A clock in the wrong order shows more than 100 years. One reading in some hundred is possible in both orders: then the next reading that
-    differs must be at most an hour later.
+    A clock in the wrong order shows more than 100 years. About one reading in several hundred is possible in both orders:
+    then the next reading that differs must be at most an hour later.
 
     Raises
     ------

@@ -221,12 +221,12 @@ class AlarmManager(RetryingStore):
         return "" if one.active else f"alarm {number} is over: the last check passed, and there is no cause to look for"
 
     async def ordered(self, number: int, by: str, look: Investigate, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Investigate an alarm because the user ``by`` asked for it: resume after its last line, or start anew if it has an answer.
+        """Investigate an alarm because the user ``by`` asked for it: resume after its last entry, or start anew if it has an answer.
 
         Raises
         ------
         Exception
-            As `look` raises; a line of the alarm records the error, unless another process has the machine.
+            As `look` raises; an entry of the alarm records the error, unless another process has the machine.
         """
         alarm = await self.note(number, AlarmKind.ORDERED, AlarmFacts(name=by, text=f"{by} has started the search for the cause"))
         terms = Schedule(f"investigation of alarm {number}", "", "UTC", self.duties.campaign)
@@ -300,7 +300,7 @@ class _Investigation(_AlarmJob):
         return self._last
 
     async def told(self, progress: ProgressSink, control: Control) -> JobOutcome:
-        """Do the work as a part of another job; a failure becomes a line of the alarm."""
+        """Do the work as a part of another job; a failure becomes an entry of the alarm."""
         try:
             return await self.work(progress, control)
         except MachineInUse:

@@ -233,5 +233,5 @@ class _CheckJob(Job[Doc]):
 
 
 def _traceback(cause: Exception) -> Exception | None:
-    """Return the error if its traceback helps; it does not for a disconnected cable."""
+    """Return the error if its traceback helps people; None for failures such as a disconnected cable."""
     return None if isinstance(cause, DriverError | AbbeError | OSError | ExceptionGroup) else cause

@@ -1,4 +1,4 @@
-"""Touches one feature of an artefact: protected way there, approach, touch, retract, repeats, and back above it.
+"""Touches one feature of an artefact: protected way there; repeated approach, touch and retract for each side; return above it.
 
 Every way between the artefact's features is a touch command, too, so that an unexpected contact stops the axes. After a missed contact,
 false trips or a stylus that stays deflected, the stylus is first withdrawn along its approach.

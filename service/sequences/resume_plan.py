@@ -90,7 +90,7 @@ class PathProgress:
         self.start_us, self.good_us = status.path_start_us, status.ctrl_us
 
     def _lag(self, gone_mm: float, position_mm: Point) -> float | None:
-        """Return the lag of the position behind constant feed, mm; None if the position is not on the path near there."""
+        """Return how far the position lags behind constant feed along the path, mm; None if it is off the path or beyond `AROUND_MM`."""
         first, last = np.searchsorted(self._arc, (gone_mm - AROUND_MM, gone_mm + AROUND_MM))
         points, arc = self._points[max(first - 1, 0) : last + 1], self._arc[max(first - 1, 0) : last + 1]
         if len(points) < 2:
@@ -111,9 +111,9 @@ class PathProgress:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class PathRemainder(PathReadings):
-    """Rest of an interrupted path, from ``offset_mm`` of its whole length ``whole_mm`` on, and the earlier readings on the stretch.
+    """Rest of an interrupted path, and the earlier readings on the stretch that is measured again.
 
-    ``arc_mm`` counts along the rest.
+    ``offset_mm``: where the rest begins on the whole path, whose length is ``whole_mm``; ``arc_mm`` counts from there.
     """
 
     offset_mm: float
@@ -121,7 +121,7 @@ class PathRemainder(PathReadings):
     feed_mm_s: float
 
     def doc(self) -> dict[str, Any]:
-        """Return the JSON object for ``path`` in the start document."""
+        """Return what a resumed run adds to ``path`` of its start document: where the rest begins, and the runs of the earlier pieces."""
         return {"offset_mm": self.offset_mm, "pieces": [{"run": p.run, "to_mm": p.to_mm} for p in self.pieces]}
 
 
@@ -185,7 +185,7 @@ class StretchComparison:
             )
 
     def add(self, sample: BarSample) -> None:
-        """Add the next sample. Raises StretchDiffers if the stretch reads otherwise, or could not be read."""
+        """Add the next sample. Raises StretchDiffers as `judge` does, or if the first samples were lost."""
         before, self._last = self._last, sample
         if self.off_mm is not None or not on_path(sample.status):
             return
@@ -207,7 +207,7 @@ class StretchComparison:
         Raises
         ------
         StretchDiffers
-            The stretch reads otherwise, or has too few readings.
+            The bar does not repeat its earlier readings on the stretch, or gave too few valid ones.
         """
         if self.off_mm is not None:
             return
@@ -387,7 +387,7 @@ def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]
 
 
 def remounted(test: TestPlan, first: TestPlan, number: int) -> TestPlan:
-    """Return a test that itself mounts its set-up, as mounting ``number``; ``first``: the test that first mounted this set-up."""
+    """Return a test that begins by mounting its set-up anew, as mounting ``number``; ``first``: the test that mounted the set-up first."""
     named = anew(test, number)
     if test.mounts:
         return replace(named, steps=(Unmount(), *test.steps))

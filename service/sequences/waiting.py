@@ -1,6 +1,6 @@
 """Waits for a person (pause) or for a condition to clear (suspension), and checks all preconditions again before resuming.
 
-The preconditions: the same controller run, the same table, and no interlock.
+The preconditions: no restart of the controller, the same table, and no interlock.
 """
 
 from __future__ import annotations

@@ -262,8 +262,8 @@ async def known_status(ask: Callable[[], Awaitable[ControllerStatus]], unknown_s
 
 
 class Stalls:
-    """Measures stalls of this computer while it is open. ``longest_s``: longest time, s, without the event loop; measured every
-    `LOOK_S`."""
+    """Measures stalls of this computer while it is open. ``longest_s``: longest time, s, for which the event loop did
+    not run, found by a timer that is due every `LOOK_S`."""
 
     def __init__(self) -> None:
         self.longest_s = 0.0
@@ -301,7 +301,7 @@ LAST_LINES_S = 5.0
 
 
 def links_of(session: Session) -> dict[str, Incidents]:
-    """Return the incident lists of a session's links by device name; devices without one are left out."""
+    """Return the incident lists of a session's links by device name; devices without a link are left out."""
     found = {name: getattr(getattr(session, attribute, None), "incidents", None) for attribute, name in LINKS.items()}
     return {name: one for name, one in found.items() if isinstance(one, Incidents)}
 

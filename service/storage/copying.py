@@ -56,7 +56,7 @@ def copy_online(source: Path, target: Path, locked_s: float = LOCKED_S) -> None:
 
 
 def _stall_detection(locked_s: float, restarts: int | None) -> Callable[[int, int, int], None]:
-    """Return a callback for the steps of SQLite's backup that ends a copy without progress, or after too many ``restarts`` (None: any)."""
+    """Return a callback for each step of SQLite's backup. It ends a copy that stalls or restarts over ``restarts`` times (None: any)."""
     last_left, restarted, moved_s = -1, 0, time.monotonic()
 
     def after_step(_status: int, left: int, _total: int) -> None:

@@ -50,7 +50,7 @@ def check_fresh(tables: list[TableInForce], images: Images, *, confirmed_none: b
     images : callable
         Returns the image of a CRC, or None.
     confirmed_none : bool
-        A person states that no correction was in force. Decides only if neither image nor controller does.
+        A person states that no correction was in force. This counts only if neither the image nor the record of the run shows it.
 
     Raises
     ------

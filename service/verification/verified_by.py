@@ -211,7 +211,7 @@ def _measured_with(store: Store, record: VerificationRecord, crc: int | None, si
 
 
 def began(store: Store, record: VerificationRecord) -> datetime:
-    """Return when a check's campaign began, or when the check began if it has no campaign; `--accept-table` accepts a table earlier."""
+    """Return when a check's campaign began, after any acceptance by `--accept-table`; without a campaign, when the check began."""
     if record.campaign_id is None:
         return started(record)
     return datetime.fromisoformat(store.campaigns.find(record.campaign_id).created_utc)

@@ -44,8 +44,8 @@ SCHEMA = 1
 
 @dataclass(frozen=True)
 class VerificationFigures:
-    """Figures of one verification: body diagonals by name, and the helix. ``of``: ``diagonals`` may instead hold an artefact's poses.
-    ``reversals``: mean reversal values of the body diagonals, by their names.
+    """Figures of one verification. ``diagonals``: body diagonals or, as ``of`` states, poses of an artefact, by name. ``reversals``: mean
+    reversal values of the body diagonals, by name.
 
     ``air_c``: lowest and highest air temperature, None without any reading. ``tables``: CRC of every table that was active during its runs;
     None stands for a run that does not record it.

@@ -50,11 +50,11 @@ def parse(words: list[int]) -> tuple[int, Correction]:
     magic, fmt, kind, length, _, lsb, _, nx, ny, nz, _, *ends = _HEADER.unpack(to_bytes(words[:HEADER_WORDS]))
     counts = (nx, ny, nz)
     if (magic, fmt, lsb) != (MAGIC, FORMAT, LSB_NM):
-        raise ImageError("magic, format or table unit differ")
+        raise ImageError("the header has another magic number, format or table unit than docs/protocols/cnc.md")
     if kind not in (0, 1, 2):
         raise ImageError(f"kind {kind} is none of 0, 1, 2")
     if kind == 0 and counts != (0, 0, 0):
-        raise ImageError("kind 0 has no grid")
+        raise ImageError("an image of kind 0 must have no grid points")
     expected = HEADER_WORDS + {0: 0, 1: 3 * sum(counts), 2: 3 * nx * ny * nz}[kind]
     if length != expected or length > min(len(words), BANK_WORDS):
         raise ImageError(f"length {length}, expected {expected}")

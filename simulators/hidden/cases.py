@@ -40,7 +40,7 @@ class FittedRuns:
         return np.vstack([of_run(r) for r in self.runs])
 
     def moved(self, direction: int, *functions: Function) -> F:
-        """Return the readings, mm, of displacements along an axis: one column per function, which must be 0 where a cup is set up."""
+        """Return the readings, mm, of displacements along an axis, one column per function; a function must be 0 where a cup is set up."""
         return self.stack(lambda r: _zeroed(r, r.track.look[:, direction, None] * np.stack([f(r.track) for f in functions], axis=1)))
 
     def warming(self, direction: int, arm: Callable[[F], F], taus: tuple[float, ...] = DRIFT_S) -> Iterator[F]:

@@ -177,7 +177,7 @@ def pole_of(recipe: CupTest) -> tuple[Point, Array]:
 
 
 def over_pole(cup: Cup, target_mm: Point, feed_mm_min: float) -> list[Step]:
-    """Return the steps from the centre, or from the axis above it, to a point of the sphere: up to the pole, down along the sphere.
+    """Return the steps to a point of the sphere from the centre, or from above it on the cup's axis: to the pole, then along the sphere.
 
     A straight move from the centre to a point below the equator would pass through the cup.
     """

@@ -137,7 +137,7 @@ class ArtefactTest(TestRecipe):
             )
 
     def _order(self, touches: list[TouchFeature]) -> Iterator[TouchFeature]:
-        """Yield the touches of the pose. Ways to and from a sphere lie at the height of the highest place above anything."""
+        """Yield the touches of the pose. With a qualification sphere all ways lie at one height, that of the highest clear place."""
         again = touches[:1]
         if self.sphere is not None:
             again = [self._qualification(self.sphere, touches[0]), touches[0]]
@@ -200,7 +200,7 @@ def verifying_poses(machine: Machine, name: str, recipes: tuple[object, ...]) ->
 
 
 def _sides(up: Array, start_deg: float, *, ball: bool) -> tuple[tuple[float, float, float], ...]:
-    """Return unit vectors to four touches about ``up``, opposite ones in turn, from ``start_deg`` on; of a ball also its top."""
+    """Return unit vectors from the centre to the touches: two opposite pairs about ``up`` from ``start_deg`` on; a ball's top first."""
     first = np.eye(3)[int(np.argmin(np.abs(up)))]
     first = first - (first @ up) * up
     first /= np.linalg.norm(first)

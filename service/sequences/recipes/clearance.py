@@ -55,7 +55,7 @@ class Solids(Protocol):
         ...
 
     def gaps_mm(self, places_mm: Array, up: Array, part: ProbePart) -> Array:
-        """Return the least gap between a part of the probe and each body, over these places of its ball, shape (bodies,)."""
+        """Return the least gap, mm, between a part of the probe and each body over these places of the probe's ball, shape (bodies,)."""
         ...
 
 

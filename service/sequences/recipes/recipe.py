@@ -410,7 +410,7 @@ LaserRecipe = Diagonal | FaceDiagonal | Linear
 
 
 def _increment(out: Array, steps: int) -> Doc:
-    """Return the key of the length of one step; overruns are not part of a step."""
+    """Return the field ``increment_mm``: length of one step in X, Y and Z; an overrun is not a step."""
     return {"increment_mm": [float(v) for v in (out[-1] - out[0]) / steps]}
 
 

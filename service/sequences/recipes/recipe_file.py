@@ -122,7 +122,7 @@ class RecipeFile(BaseModel):
     artefact: dict[str, ArtefactObject] = Field(default_factory=dict)
 
     def recipes(self) -> tuple[Recipe, ...]:
-        """Return the tests; a test of an artefact gets its description."""
+        """Return the tests; each test of an artefact gets the description of its artefact."""
         return tuple(replace(t, plate=self.artefact.get(t.artefact)) if isinstance(t, ArtefactTest) else t for t in self.test)
 
 
