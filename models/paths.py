@@ -334,7 +334,9 @@ def helix_points(
         finite numbers. Fewer than three turns are accepted, but such a helix determines few errors.
     """
     if n < 2 or not 0 < radius_mm < np.inf or not np.isfinite(turns) or not 0 < span_rad <= np.pi / 2:
-        raise ValueError("helix: n must be 2 or more, the radius positive, turns finite, and the span in (0, pi/2]")
+        raise ValueError(
+            f"helix: n = {n} must be 2 or more, radius {radius_mm:g} mm positive, turns {turns:g} finite, span {span_rad:g} in (0, pi/2]"
+        )
     if law not in ("angle", "area"):
         raise ValueError(f"helix: law {law!r} must be 'angle' or 'area'")
     if axis not in (0, 1, 2):
@@ -387,7 +389,7 @@ def helix_points_likely_code(centre_mm: F1, radius_mm: float, *, turns: float) -
         Radius not positive, or turns not finite.
     """
     if not 0 < radius_mm < np.inf or not np.isfinite(turns):
-        raise ValueError("helix: the radius must be positive and turns finite")
+        raise ValueError(f"helix: radius {radius_mm:g} mm must be positive, and turns {turns:g} finite")
     t = 0.1 * np.arange(63)
     phi, theta = t / 4.0, turns * t
     unit = np.stack([np.sin(phi) * np.cos(theta), np.cos(phi), np.sin(phi) * np.sin(theta)], axis=1)

@@ -12,7 +12,7 @@ from abbe.service.rendering.palette import style_rules
 
 @dataclass(frozen=True, slots=True)
 class Picture:
-    """One or more ``<svg>`` elements; a notebook displays it automatically."""
+    """A picture of one or more ``<svg>`` elements; a notebook displays it automatically."""
 
     svg: str
 
@@ -33,7 +33,8 @@ class Picture:
 class Estimate(NamedTuple):
     """A value and its standard uncertainty (GUM, k = 1), both in ``unit``.
 
-    ``status``: "observed", "weak" or "not observable". A value that is not observable means nothing without the other values.
+    ``status``: "observed", "weak" or "not observable". Of a value that is "not observable", the readings determine only a
+    combination with other values.
     """
 
     value: float

@@ -146,7 +146,7 @@ def _effect(label: str, strength: float, known: tuple[Effect, ...]) -> tuple[Eff
     if effect is None:
         raise EffectUnknown(f"the catalogue has no effect {name!r}", "`abbe effects` lists all")
     if key not in effect.keys:
-        raise Unusable(f"{name} has no key {key!r}", f"it has {', '.join(effect.keys) or 'none'}")
+        raise Unusable(f"{name} has no key {key!r}", f"its keys: {', '.join(effect.keys) or 'none'}")
     usual = {p.name: p.typical for p in effect.shape}
     if effect.signal(probe_paths(), key, usual)[0].shape[1] != 1:
         raise Unusable(f"{name} has several coefficients: its strength alone does not determine the readings", "simulate another effect")

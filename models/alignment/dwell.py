@@ -33,7 +33,7 @@ I1 = np.ndarray[tuple[int, ...], np.dtype[np.intp]]
 class Match:
     """An assignment: ``pairs`` maps the index of a place to the index of its standstill; ``cost``: minus the logarithm of its probability.
 
-    ``rival``: a standstill and two places to which it may belong, if another assignment is equally good.
+    ``rival``: a standstill and two places to which it may belong, if another assignment is equally good; else None.
     """
 
     cost: float
@@ -298,8 +298,8 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
     settle_s : float
         First part of each standstill, in which the axes settle and no readings are taken.
     zero : float, optional
-        Reading of the instrument at target 0, if it was zeroed there. Otherwise the match determines the offset between plan and stream; a
-        match is refused if two offsets explain the stream equally well.
+        Reading of the instrument at target 0, if it was zeroed there. None: the match determines the offset between plan and stream, and
+        is refused if two offsets explain the stream equally well.
     step : float
         Smallest step of the readings; the uncertainty of a mean contains it (GUM F.2.2.1), because samples at rest share their rounding.
 
@@ -310,7 +310,7 @@ def detect(t_s: F1, y: F1, planned: tuple[PlannedDwell, ...], *, settle_s: float
         plan was found; or two matches are equally good.
     """
     if t_s.size < 10 or len(planned) < 2:
-        raise ValueError("dwells: a stream of ten samples or more and a plan of two standstills or more are needed")
+        raise ValueError(f"dwells: {t_s.size} samples and {len(planned)} planned standstills given, at least 10 and 2 needed")
     targets = np.array([p.target for p in planned])
     smallest = float(np.abs(np.diff(targets)).min())
     if not smallest > 0.0:
@@ -435,7 +435,7 @@ def _unambiguous(best: Match, found: tuple[Standstill, ...]) -> dict[int, int]:
         return best.pairs
     stand, ours, other = best.rival
     at_s = found[stand].start_s - found[0].start_s
-    which = f"planned standstill {ours + 1}" + (f" or {other + 1}" if ours != other else ", but another standstill may be it, too")
+    which = f"planned standstill {ours + 1}" + (f" or {other + 1}" if ours != other else ", but so may another standstill")
     raise ValueError(f"dwells: the standstill that began {at_s:.1f} s after the first may be {which}; nothing is guessed, measure again")
 
 

@@ -200,9 +200,9 @@ def enough_for_the_field(solution: JointSolution) -> frozenset[str]:
 
 
 def _field(solution: JointSolution) -> tuple[list[int], F2]:
-    """Return the indices of the q smooth coefficients, and the deviation over the volume per unit of each and of the six rigid motions.
+    """Return the indices of the q smooth coefficients, and the deviation over the volume per unit of each, then of each of 6 rigid motions.
 
-    The deviation has shape (3 x points, q + 6). Terms above `SMOOTH_ORDER` are left out, because no angle has the same effect.
+    The deviation has shape (3 x points, q + 6). Terms above `SMOOTH_ORDER` are left out, because no angle has the effect of such a term.
     """
     smooth = [i for i, t in enumerate(solution.terms) if t.order <= SMOOTH_ORDER]
     terms = tuple(solution.terms[i] for i in smooth)

@@ -182,7 +182,7 @@ def nodes_mm(position_mm: tuple[F1, F1, F1]) -> F2:
 def node_design(solution: JointSolution, position_mm: tuple[F1, F1, F1], *, fitted: bool = True) -> F3:
     """Return the node values of the best trilinear field per unit of each coefficient of the solution, shape (nodes, 3, terms).
 
-    ``fitted``: fit by least squares over the volume of the grid; otherwise take the deviation at the nodes themselves. A term is at most
+    ``fitted``: fit by least squares over the volume of the grid; False: take the deviation at the nodes themselves. A term is at most
     linear in the other two axes (rule G), where trilinear interpolation is exact. So a fit along the term's own axis is the fit over the
     volume (tests/models/compensation/test_tables_grid.py).
     """

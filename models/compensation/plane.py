@@ -1,7 +1,8 @@
 """One-axis tables from a deviation that is known in a part of the strokes only: in planes at one or several heights, or in a box.
 
-The axes that span this part correct each other in the directions that were sensed; other directions are not corrected. Beyond the known
-part the tables keep their end values. This is an assumption, as are the values at other positions of an axis that no plane spans.
+Every axis along which this part extends gets corrections in the directions in which the deviation was sensed; all others are zero. The
+tables rest on two assumptions: beyond the known part a table keeps its end value, and at heights without a plane the corrections are those
+of the planes.
 """
 
 from __future__ import annotations

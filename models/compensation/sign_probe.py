@@ -5,8 +5,8 @@ u . (new correction - old correction), u being the unit vector from cup to spind
 
 - `sign_proof`, before the first real table: a small known step in the table of each axis shifts the tool by S and every reading by u . S.
   Many readings determine the three components of S.
-- `probe`, for every table that is activated: compares readings at the same positions before and after. A position where the reading changes
-  otherwise than expected refutes the table, even if the change is too small to prove it.
+- `probe`, for every table that is activated: compares readings at the same positions before and after. One position at which the reading
+  does not change as expected refutes the table, even if the expected change is too small to prove the table.
 """
 
 from __future__ import annotations

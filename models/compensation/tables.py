@@ -89,8 +89,8 @@ ORDERS = range(2, 13)
 def smooth_of(tables: NineTables) -> Callable[[F2], F2] | None:
     """Fit polynomials to nine tables; return the correction (n, 3), mm, as a function of positions (n, 3), or None if a fit fails.
 
-    Each table gets the lowest order from 2 to 12 that fits its entries within 0.5 µm. The polynomials are free of interpolation corners,
-    rounding and cut ends, which a solver would take for motions of high order.
+    Each table gets the lowest order from 2 to 12 that fits its entries within 0.5 µm. The polynomials have neither
+    corners between the entries nor rounding, which a solver would take for motions of high order.
     """
     found = [[_meets(tables.position_mm[a], tables.correction_mm[a][:, i]) for i in range(3)] for a in range(3)]
     if any(one is None for row in found for one in row):

@@ -171,7 +171,7 @@ FOLDS = 5
 
 
 def left_out_gap(problem: WhitenedProblem, solved: SolvedModel, floor: Mapping[str, Floor]) -> Gap | None:
-    """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None without mean effects.
+    """Return the gap of the fitted runs, each block predicted by a fit to the other blocks; None if no mean effect was found.
 
     Unknowns of the simulation and coefficients of the effects are fitted anew without the block. Selection and non-linear parameters
     of the effects come from all readings. So this proves less than a holdout run, and more than the residuals of the fit.

@@ -60,7 +60,7 @@ class NamedEffect:
     forms : deviations from the effect's formula that were added (`abbe.models.effects.effect.Form`), by name.
     needed : rms of the holdout runs without this effect, divided by their rms with it; 1 or less: not needed. None: no holdout run, or
     the effect is a variance effect, which changes no mean reading.
-    sensor_doubt : why the temperature column of the warming part probably belongs to another part; empty without doubt.
+    sensor_doubt : why the temperature column of the warming part probably belongs to another part; empty if there is no doubt.
     """
 
     name: str
@@ -157,20 +157,24 @@ class Discovery:
     ----------
     verdict : "none": the present model explains the runs; "named": named effects are missing; "unknown": something is missing that the
         catalogue does not explain.
-    effects : the named effects, strongest evidence first. rejected : labels found but not named, each with the reason: structures without a
-    name, effects of less evidence, residues of effects. beside : structures without a name that explain a further part of the gap besides
-    the named effects, (label, evidence), strongest first. confounded_with : rivals of the named effects that the data do not exclude.
-    location : location of the gap of the present model (for "unknown": of the structure without a name). gaps : gap of the runs of each
-    role ("identify", "holdout"). alone : the result without any effect; given if chance could yield names of as little evidence
-    (`abbe.models.discovery.lack.CHANCE`). left_out : gap of the fitted runs, each predicted without its block
-    (`abbe.models.discovery.agreement`); None if there are holdout runs. residual_before_mm, residual_after_mm : residuals without and with
-    the effects, by run label. predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed
-    runs. noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals. p_value :
-    p-value of the whole finding. theta, theta_names, theta_covariance : unknowns of the present simulation, fitted together with the
-    effects. agreement : how holdout runs agree with their prediction, if nothing was found; the worst first. unjudged : holdout runs that
-    cannot be judged. unseen : blind spots of the runs, if nothing was found. fitted : significant errors that the present simulation
-    already includes (the scale of a single axis). doubt : probable fault in the data of the runs in ``location``, as text; if there is one,
-    no effect was searched.
+    effects : the named effects, strongest evidence first.
+    rejected : labels found but not named, each with the reason: structures without a name, effects of less evidence, residues of effects.
+    beside : structures without a name that explain a further part of the gap besides the named effects, (label, evidence), strongest first.
+    confounded_with : rivals of the named effects that the data do not exclude.
+    location : location of the gap of the present model (for "unknown": of the structure without a name).
+    gaps : gap of the runs of each role ("identify", "holdout").
+    alone : the result without any effect; only for named effects with a ``p_value`` of `abbe.models.discovery.lack.CHANCE` or more.
+    left_out : gap of the fitted runs, each predicted without its block (`abbe.models.discovery.agreement`); None if there are holdout runs.
+    residual_before_mm, residual_after_mm : residuals without and with the effects, by run label.
+    predicted_before_mm, predicted_mm : predictions without and with the effects, by run label; also of sealed runs.
+    noise_mm : noise of one reading of "bar" and "laser"; from repeats where these scatter less than the fit's residuals.
+    p_value : p-value of the whole finding.
+    theta, theta_names, theta_covariance : unknowns of the present simulation, fitted together with the effects.
+    agreement : how holdout runs agree with their prediction, if nothing was found; the worst first.
+    unjudged : holdout runs that cannot be judged.
+    unseen : blind spots of the runs, if nothing was found.
+    fitted : significant errors that the present simulation already includes (the scale of a single axis).
+    doubt : probable fault in the data of the runs in ``location``, as text; if there is one, no effect was searched.
     """
 
     verdict: Verdict

@@ -247,7 +247,7 @@ def _judge(
 
 
 def _parts(effects: Sequence[NamedEffect], rest: float) -> dict[str, str]:
-    """Return, by label, the reason against effects that may be only a part of what all findings leave unexplained (`REST_SHARE`)."""
+    """Return, by label, why not to name an effect: it may be only a part of what all findings leave unexplained (`REST_SHARE`)."""
     return {
         e.label: f"evidence {e.evidence:.0f}, but {rest:.0f} stays unexplained: the effect may be only a part of that"
         for e in effects
@@ -269,7 +269,10 @@ def _with_ties(mean: Mapping[int, NamedEffect], pairs: frozenset[tuple[str, str]
 
 
 def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[frozenset[str], tuple[Structure, ...]]:
-    """Find waves that only two close pitches fit: their period is not constant. Return their labels, and the waves without a name."""
+    """Find waves that only two close pitches fit: the period is not constant.
+
+    Return the labels of both pitches, and each such wave as a structure without a name.
+    """
     labels, waves = set[str](), []
     for i, j in permutations(range(len(found)), 2):
         second, first = found[i].pick, found[j].pick
@@ -301,7 +304,7 @@ def _uneven(problem: WhitenedProblem, found: Sequence[Selection]) -> tuple[froze
 def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int], predicted: Mapping[str, F1]) -> dict[int, float | None]:
     """Return a ratio for each effect, by index: rms residual of the holdout runs without the effect, over the rms with all effects.
 
-    None without holdout runs (`NamedEffect.needed`). ``predicted``: readings with all effects, mm, by run.
+    The ratio is None without holdout runs (`NamedEffect.needed`). ``predicted``: readings with all effects, mm, by run.
     """
     fitted_setups = {r.path.setup for r in problem.runs}
     judges = [r for r in problem.case.runs if r.role == "holdout" and r.deviation_mm is not None and r.valid.any()]
@@ -317,9 +320,9 @@ def _needed(problem: WhitenedProblem, solved: SolvedModel, which: Sequence[int],
 
 
 def _confounded(effects: Sequence[NamedEffect]) -> tuple[str, ...]:
-    """Return the labels of rivals that lack less than `EXCLUDED` of chi-square, and of named effects that are rivals (`ties`).
+    """Return the labels of alternatives that lack less than `EXCLUDED` of an effect's chi-square, or that are named effects too (`ties`).
 
-    `NamedEffect.alternatives` also contains weaker rivals.
+    `NamedEffect.alternatives` also contains weaker alternatives.
     """
     named = {e.label for e in effects}
     near = (label for e in effects for label, deficit in e.alternatives if deficit < EXCLUDED / 2.0 or label in named)

@@ -113,7 +113,7 @@ def _strong(sizes: dict[K, float]) -> tuple[K, ...]:
 
 
 def _time(rows: _SignalRows) -> tuple[float, float] | None:
-    """Interval that holds the central `SHARE` of the energy, if it is a small part of the campaign."""
+    """Time interval, s, that holds the central `SHARE` of the signal's energy; None if longer than `LOCAL` of the readings' time span."""
     order = np.argsort(rows.t_s, kind="stable")
     t, cumulative = rows.t_s[order], np.cumsum(rows.energy[order])
     low, high = np.interp([(1 - SHARE) / 2 * cumulative[-1], (1 + SHARE) / 2 * cumulative[-1]], cumulative, t)

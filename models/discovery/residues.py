@@ -78,8 +78,9 @@ def shared(problem: WhitenedProblem, found: Sequence[Selection]) -> dict[tuple[s
 def too_smooth(problem: WhitenedProblem, solved: SolvedModel, loud: Sequence[VarianceFinding], rest: F1) -> frozenset[tuple[str, str]]:
     """Find the mean effects of other axes that are too smooth to leave the scatter of a stick-slip: pairs (stick-slip, mean effect).
 
-    The function compares squared second differences (`ROUGHEST`), weighted with the variance of the stick-slip: those of the residuals,
-    above their mean outside of the places of the stick-slip, and those of the effect's own readings.
+    Roughness is the mean of squared second differences, weighted with the variance of the stick-slip. An effect is too smooth if the
+    roughness of the residuals, less their roughness at bar readings without stick-slip, exceeds `ROUGHEST` times the roughness of the
+    effect's own signal.
 
     Parameters
     ----------
@@ -114,13 +115,15 @@ def residues(
 ) -> Mapping[str, str]:
     """Find named effects that may be mere residues: deviations of a stronger effect from its formula.
 
-    An effect is a residue if its evidence is below this share of the evidence of
+    An effect is a residue of a stronger effect if its evidence is below this share of the stronger effect's evidence:
 
-    - any stronger effect: 0.1 %;
-    - for stick-slip and vibration, an effect at reversals or a cyclic error: 1 %; another mean effect: 0.3 %;
-    - an effect at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo mismatch): 1.25 %;
-    - a related effect: 4 %. Related are another thermal effect (bar included), a curve over the same axis or in the same direction (also
-      positioning and thermal growth of the same axis), another lag of the drives; for a misaligned beam, refraction of air.
+    - 1.25 % if both act at the reversals of the same axis (lost motion, its change along the axis, spikes, lateral play, servo mismatch);
+    - 4 % if both are related: two thermal effects (bar included), two lags of the drives, two curves over the same axis or in the same
+      direction, nonlinear positioning and thermal growth of the same axis, or a misaligned beam beside refraction of air;
+    - if the weaker effect is stick-slip, vibration or outliers of the bar, and the stronger one changes the mean: 1 % beside effects at
+      reversals and cyclic errors, 0.3 % beside others;
+    - 1 % for outliers of a laser beside a wave with harmonics;
+    - 0.1 % for any other two effects.
 
     Parameters
     ----------
@@ -190,7 +193,7 @@ def leaning(problem: WhitenedProblem, found: Sequence[Selection], residue: Set[s
     """Find names that score nothing once the residues are taken out of the fit, and give the reason by label.
 
     Such a name only repairs what a residue spoils in other runs. For example, if three axes seem to grow because the ball-bar grows, the
-    scale of the laser has to shift, too. The reason lists every residue that alone makes the name score again; if none does, all residues.
+    scale of the laser has to shift, too. The reason lists every residue that alone makes the name score again; if none does, it lists all.
 
     ``residue``: labels of the findings that are residues; labels of variance effects, which are not in the fit, change nothing.
     """

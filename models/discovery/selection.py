@@ -394,7 +394,10 @@ def u_moment(problem: WhitenedProblem, picks: Sequence[Pick], i: int) -> float:
 
 @dataclass(frozen=True)
 class Rival:
-    """A name that could replace a chosen one. ``deficit``: the chosen score minus its score; ``share``: its gain over the chosen gain."""
+    """A name that could replace a chosen name.
+
+    ``deficit``: the chosen name's score minus the rival's; ``share``: the rival's gain divided by the chosen name's.
+    """
 
     pick: Pick
     deficit: float

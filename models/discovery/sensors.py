@@ -19,7 +19,7 @@ its correlation stays below `STRAYS`. In the practice set every own column reach
 
 
 def exchanged_sensor(paths: Sequence[Path], name: str, key: str, values: Values) -> str:
-    """Return a warning if a named growth follows another temperature column and not the growing part's own; empty otherwise.
+    """Return a warning if a named growth follows another temperature column and not the growing part's own, else an empty text.
 
     Parameters
     ----------

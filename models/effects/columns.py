@@ -193,7 +193,7 @@ def warmth(t_s: F1, tau_s: float) -> F1:
 
 
 def rise_of(paths: tuple[Path, ...], sensor: str) -> Callable[[F1], F1] | None:
-    """Return the rise of a temperature since the start of the campaign, K, as a function of campaign time; None without the sensor.
+    """Return the rise of a temperature since the start of the campaign, K, as a function of campaign time; None if no run has the sensor.
 
     Readings are averaged over blocks of a run, because noise of a regressor biases the fit. Linear interpolation fills the gaps between
     runs, where cups are set.

@@ -203,7 +203,7 @@ def since_reversal(q_mm: F2, sign: F2, step_mm: F2 | None = None) -> F2:
     Parameters
     ----------
     step_mm : array, shape (n, 3), optional
-        Motion per sample, at every sample. If given, an axis reverses where it comes to rest between two samples; otherwise at a sample.
+        Motion per sample, at every sample. If given, an axis reverses where it comes to rest between two samples; if not, at a sample.
     """
     travel = np.abs(np.diff(q_mm, axis=0, prepend=q_mm[:1])).cumsum(axis=0)
     out = np.full(q_mm.shape, FAR_MM)

@@ -35,7 +35,7 @@ class Approaches:
         Raises
         ------
         ValueError
-            Fewer than two positions, not growing, unequal shapes, or a position without a reading from one side.
+            Fewer than two positions, positions that do not grow, unequal shapes, or a position without a reading from one side.
         """
         m = self.position_mm.size
         if m < 2 or not (np.diff(self.position_mm) > 0.0).all():
@@ -189,7 +189,7 @@ def _of_s(side: _Side) -> F1:
 
 
 def _range(at: F1, upper: F1, lower: F1, u: F1, budget: ScaleBudget) -> Value:
-    """Return max(upper) - min(lower), with the uncertainty at the two positions of these extremes and of the slope."""
+    """Return max(upper) - min(lower) with its uncertainty, from ``u`` at both extremes and the uncertainty of the slope."""
     hi, lo = int(np.argmax(upper)), int(np.argmin(lower))
     apart = float(np.hypot(u[hi], u[lo])) if hi != lo else 0.0
     return Value(float(upper[hi] - lower[lo]), float(np.hypot(apart, _tilt(at, upper, lower, budget))))

@@ -40,7 +40,10 @@ class CircularTest:
             Unequal shapes, fewer than 8 readings, or numbers that are not finite.
         """
         if self.angle_rad.shape != self.deviation_mm.shape or self.angle_rad.ndim != 1 or self.angle_rad.size < 8:
-            raise ValueError("ISO 230-4: a circle needs as many angles as deviations, eight or more")
+            raise ValueError(
+                f"ISO 230-4: angles of shape {self.angle_rad.shape} and deviations of shape {self.deviation_mm.shape}; "
+                "a circle needs eight or more deviations, each with its angle"
+            )
         if not (np.isfinite(self.angle_rad).all() and np.isfinite(self.deviation_mm).all()):
             raise ValueError("ISO 230-4: angles and deviations must be finite numbers")
 

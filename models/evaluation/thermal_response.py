@@ -118,7 +118,10 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class ThermalResponse:
-    """Fitted response: an average of ``fits`` with ``weights``; ``shift``: None without one; ``widening``: factor on u of predictions."""
+    """Fitted response: an average of ``fits`` with ``weights``.
+
+    ``shift``: offset of some runs, None if there is none; ``widening``: factor on u of predictions.
+    """
 
     fits: tuple[Fit, ...]
     weights: F1
@@ -265,7 +268,7 @@ def _sigmas(fit: Fit) -> float:
 
 
 def probability_shifted(shift: Shift | None, kept: Sequence[int], run: float) -> float:
-    """Probability that the shift acts in a run that was not fitted: 0, 1, or a half between a run with and one without it.
+    """Probability that the shift acts in a run that was not fitted: 0 or 1, or 0.5 if it acts in only one of the two neighbouring runs.
 
     ``run``: position of this run among the runs ``kept``, possibly between two of them.
     """

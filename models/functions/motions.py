@@ -129,7 +129,7 @@ def as_angle(function: AxisFunction, reference_mm: float) -> FromZero:
 
 
 def least_squares_line(function: AxisFunction, stroke_mm: ArrayLike) -> tuple[float, float]:
-    """Return slope (per mm) and value at axis zero of the line that `as_straightness` removes; raises as that does."""
+    """Return slope (per mm) and value at axis zero of the line that `as_straightness` removes, with the same errors."""
     return _line(function, _inside(function, stroke_mm))
 
 

@@ -104,9 +104,9 @@ def grid_lines(axes_mm: F2) -> Lines | None:
 
 
 def _on_grid(machine: Machine, motions: Motions, axes_mm: F2) -> F2 | None:
-    """Return `field_mm` of a full grid, None for other points: what is computed while the points are compared is then left.
+    """Return `field_mm` on a full grid; None for other points, for which the computation stops at the first difference from a grid.
 
-    So the threads are started once, and none waits for the other between the two parts.
+    Comparison and computation share the threads, so these are started once and do not wait for each other between the two tasks.
     """
     lines = _edges(axes_mm)
     if lines is None:
@@ -134,7 +134,7 @@ def _in_parts(count: int, work: Callable[[int], bool], points: int) -> bool:
 
 
 def _edges(axes_mm: F2) -> Lines | None:
-    """Return the lines of the full grid that the points can only be, by three of their edges; None if they can be none."""
+    """Return the lines of the only full grid that the points may form, taken from three of its edges; None if they cannot form a grid."""
     count = len(axes_mm)
     if count < LEAST or axes_mm.shape[1:] != (3,):
         return None

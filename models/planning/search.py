@@ -59,7 +59,7 @@ _KNOWN = 1e12
 
 
 def extra_minutes(minutes: SetupMinutes, machine_min: float, test: Measurement, before: tuple[Measurement, ...]) -> float:
-    """Set-up and machine time of a test when its mounting already holds ``before``."""
+    """Set-up and machine minutes of a test whose mounting already has the tests ``before``."""
     if isinstance(test, HelixTest):
         if not before:
             return minutes.cup + machine_min
@@ -91,7 +91,7 @@ class PlanSearch:
         self._rows = field_rows(self.what, self.share, SEARCH_NODES)
 
     def cost_min(self, test: Measurement, before: tuple[Measurement, ...]) -> float:
-        """Minutes that a test takes when its mounting already holds ``before``."""
+        """Minutes of a test whose mounting already has the tests ``before``."""
         if test not in self._machine_min:
             self._machine_min[test] = machine_seconds(self.what.machine, test, self.what.tools) / 60.0
         return extra_minutes(self.what.tools.setup, self._machine_min[test], test, before)
@@ -155,7 +155,7 @@ class PlanSearch:
         return sorted((t for t, r in rates.items() if r > 1e-6), key=lambda t: -rates[t])
 
     def _affordable(self, chosen: Chosen, budget_min: float, pool: tuple[Measurement, ...]) -> dict[Measurement, float]:
-        """Minutes of each test, of the pool or at a cup already chosen, that can come next within the budget."""
+        """Minutes of every test, from the pool or at a cup already chosen, that can come next and fits into the budget."""
         costs = {}
         for test in (*pool, *self._at_cups(chosen)):
             before = chosen.get(test.mounting, ())

@@ -375,14 +375,17 @@ def form_rows(p: ArtefactPoints, features: Sequence[str], nominal_mm: F2, names:
 
 
 def _expansion(p: ArtefactPoints, known: Known) -> tuple[float, F1]:
-    """Expansion per K, and temperature that lengthens each reading: a probed artefact's own now, a workpiece's when it was made."""
+    """Expansion, 1/K, and its factor in each reading, K: a probed artefact's temperature; minus a workpiece's at manufacture."""
     more, offset = known.get(f"expansion_{p.artefact}", f"warmth_{p.artefact}")
     sensed = p.warm_K if p.source == "length" else p.warm_K + offset
     return p.expansion_per_K + float(more), -sensed if p.source == "cmm" else sensed
 
 
 def _place_slopes(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nominal_mm: F2, back: F2, moved: F2) -> dict[str, F1]:
-    """Derivatives of readings by form, scale, expansion and CMM; ``back``: derivative of readings by place; ``moved``: deviation (CMM)."""
+    """Derivatives of readings by form, scale, expansion and CMM.
+
+    ``back``: derivative of each reading by its feature's place; ``moved``: the machine's deviation there, in artefact axes, mm.
+    """
     out: dict[str, F1] = {}
     for i, f in enumerate(feature):
         for k in range(3):

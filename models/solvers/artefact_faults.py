@@ -193,7 +193,7 @@ def _step(problem: CampaignProblem, fit: CampaignFit) -> tuple[tuple[RunData, ..
 def _moved_step(
     runs: tuple[RunData, ...], problem: CampaignProblem, fit: CampaignFit, label: str, settle: Settle
 ) -> tuple[tuple[RunData, ...], CampaignProblem, CampaignFit]:
-    """Move a step past neighbouring points that the fit left out, if the fit then leaves out fewer: those lay on the other side."""
+    """Move a step past neighbouring points that the fit left out (they may lie on its other side), if a new fit leaves out fewer points."""
     i = next(k for k, r in enumerate(runs) if r.label == label)
     run, weight = runs[i], problem.split(fit.weight)[i]
     assert run.points is not None

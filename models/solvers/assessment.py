@@ -201,14 +201,18 @@ class MapAgainstPrior:
 
     @property
     def carried(self) -> bool:
-        """Whether readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times this rms, and
-        the runs measured enough for it (`read`).
+        """Whether readings support the map: its uncertainty is at most the priors' rms, its rms at most `LARGEST_MAP` times the priors'
+        rms, and the runs measured enough for it (`read`).
         """
         return self.u_mm <= self.prior_mm and self.predicted_mm <= LARGEST_MAP * self.prior_mm and self.read
 
     @property
     def read(self) -> bool:
-        """Whether the map is at most `MOST_READ` times a run's rms above the priors' rms, or is known to the share `WELL_KNOWN`."""
+        """Whether the runs measured enough for the map.
+
+        This holds if its rms exceeds the priors' rms by at most `MOST_READ` times ``measured_mm``, or if its relative uncertainty is at
+        most `WELL_KNOWN`.
+        """
         return self.predicted_mm <= self.prior_mm + MOST_READ * self.measured_mm or self.u_mm <= WELL_KNOWN * self.predicted_mm
 
 

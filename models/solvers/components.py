@@ -219,7 +219,7 @@ def slope(sums: InformationSums, c: Components, model: SizeModel, p: ComponentPo
 
 
 def _information_shares(sums: InformationSums, w: F1, half: F1, cov: F2, hat: F2) -> list[F2]:
-    """Covariance times the information of each instrument; the sum is known (``hat``), so the last product is the remainder."""
+    """Covariance times the information of each instrument; ``hat`` is the sum of these products, so the last one is the remainder."""
     used = np.flatnonzero(sums.count > 0)
     out = [np.zeros_like(cov) for _ in w]
     rest = hat
@@ -298,8 +298,8 @@ def _moved(c: Components, step: F1, model: SizeModel) -> Components:
 def fit_shapes(sums: InformationSums, model: SizeModel, start: Components) -> tuple[SizeModel, FittedComponents]:
     """`estimate`, including the correlation length of the error motions and the share of their variance at the ends of the strokes.
 
-    The smaller share is taken only if the log evidence gains `CLEAR`: without readings near the ends, too small a share costs more than
-    too large a share. ``sums`` are those of the unknowns in units of their typical size.
+    The smaller one of `ENDS_SHARES` is taken only if the log evidence gains `CLEAR`: without readings near the ends, too small a share
+    costs more than too large a share. ``sums`` are those of the unknowns in units of their typical size.
     """
     usual, least = ENDS_SHARES
     best = _fit_length(sums, with_shapes(model, model.length, usual), start)

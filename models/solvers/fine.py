@@ -1,9 +1,9 @@
 """Fine structure of a machine's motions in points of artefacts: pitch errors of screws, and errors that change from position to position.
 
-Polynomials are too smooth for it, and an artefact has too few points to sample it. Errors that change from position to position get one
-unknown per position of an axis (`abbe.models.solvers.artefact.Fine`); at other positions they add to the uncertainty. Periods are searched
-in the displacements at these positions (`abbe.models.solvers.waves`). Every probable period enters the model with a size weighted by its
-probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases).
+Polynomials are too smooth for fine structure, and an artefact has too few points to sample it. Errors that change from position to position
+get one unknown per position of an axis (`abbe.models.solvers.artefact.Fine`); at other positions they add to the uncertainty. Periods are
+searched in the displacements at these positions (`abbe.models.solvers.waves`). Every probable period enters the model with a size weighted
+by its probability: features stand at multiples of a pitch, so several periods often explain the readings (aliases).
 """
 
 from __future__ import annotations

@@ -179,7 +179,7 @@ def kept(make: Callable[Concatenate[JointSolution, Q], T]) -> Callable[Concatena
 def widened(solution: JointSolution, source: str, factor: F2) -> JointSolution:
     """Return the same solution with one more part of its covariance, factor factor^T (`JointSolution.added`), shape (p, k).
 
-    No unknown gets less sure than its prior.
+    The standard uncertainty of an unknown grows at most to its prior standard deviation.
     """
     left = np.maximum(solution.prior_sd**2 - solution.estimate.covariance.diagonal(), 0.0)
     size = np.sum(factor**2, axis=1)
@@ -217,7 +217,8 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
         Highest Legendre order of the error motions. Default: chosen by held-out runs, with higher orders up to 12 as nuisance unknowns. If
         given, there are no terms above it, so the uncertainties hold only for a machine of that order.
     model : "rigid6", "rigid21" or "auto"
-        Three scales and three squareness errors; 21 error motions; or these six errors if left-out set-ups and regions do not support more.
+        rigid6: three scales and three squareness errors; rigid21: 21 error motions; auto: rigid6 unless left-out set-ups and regions
+        support rigid21.
     sigma_mm, floor_mm : dict with keys "bar", "laser", optional
         Start values of the estimated noise: standard uncertainty of one raw reading, and least standard uncertainty of an averaged value.
         Default: from repeats, and the resolution.

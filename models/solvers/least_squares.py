@@ -95,7 +95,7 @@ def solve_map(names: tuple[str, ...], a: F2, y: F1, sigma: F1, prior_sd: F1) -> 
     y, sigma : arrays, shape (n,)
         Observations and their standard uncertainty.
     prior_sd : array, shape (p,)
-        Prior standard deviation; ``inf`` for none.
+        Prior standard deviation; ``inf``: no prior.
 
     Raises
     ------

@@ -453,7 +453,7 @@ class _Laser:
 
     @cached_property
     def _path(self) -> tuple[F2, F2, F1, F1]:
-        """Nominal place since the zero; normal / (m.n), both (n, 3); nominal path and what the mirror adds to it, both (n,), mm."""
+        """P - P0 and m / (m.n), shape (n, 3); nominal displacement along the beam, and m.(P - P0) / (m.n) minus it, shape (n,), mm."""
         axes_mm = self.run.axes_mm
         nominal = axes_mm - (axes_mm[0] if self.run.start_mm is None else self.run.start_mm)
         deviation = self.places.deviation_mm(self.motions)

@@ -239,7 +239,7 @@ def suspects(machine: Machine, runs: Sequence[RunData], *, limit: float = STRONG
 
 
 def _cleaned(run: _Run, others: Posterior) -> _Run | None:
-    """The run without readings that are outliers relative to the other runs; None without outliers, or with too many."""
+    """The run without readings that are outliers relative to the other runs; None if no readings or too many are outliers."""
     part = run.as_is
     spread = scipy.linalg.solve_triangular(others.factor, part.a.T, lower=True).T
     off, drop = part.y - part.a @ others.theta, np.zeros(part.y.size, dtype=bool)

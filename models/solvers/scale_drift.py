@@ -1,7 +1,8 @@
 """A scale that changes while the machine is measured, such as a ball screw that warms up: the residuals show the change, and U includes it.
 
 The solution's scales are averages over the campaign. A screw that grows by 6 um/m in that time has another scale before and after it, which
-no reading of the campaign shows. A bar or a laser that changes looks alike, so an axis is named only if it explains more than they do.
+no reading of the campaign shows. A bar or a laser that changes has the same effect on the readings, so an axis is named only if it explains
+them better.
 """
 
 from __future__ import annotations

@@ -68,7 +68,10 @@ class StatedInputs:
             if not (np.isfinite(value) and value >= 0):
                 raise ValueError(f"uncertainty inputs: {name} is {value}, must be a number of 0 or more")
         if self.orders_above < 0 or not self.repeatability_dof > 0:
-            raise ValueError("uncertainty inputs: orders_above must be 0 or more, repeatability_dof above 0")
+            raise ValueError(
+                f"uncertainty inputs: orders_above is {self.orders_above}, must be 0 or more; "
+                f"repeatability_dof is {self.repeatability_dof}, must be above 0"
+            )
 
     def as_measured(self) -> StatedInputs:
         """The same inputs for a prediction at the temperature of the measurement, where the scales' temperature has no uncertainty."""

@@ -98,7 +98,7 @@ def propose(
     -------
     NextTest or None
         None without rivals, or if every addition gains less than `LEAST` sigmas. If every addition gains less than `WORTH`, the result is
-        the best one.
+        the addition with the largest gain.
     """
     found = [p for p in prospects(case, leader, rivals, noise_mm) if p.gain.max() >= LEAST]
     if not found:

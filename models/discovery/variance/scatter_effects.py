@@ -289,7 +289,7 @@ def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[f
 
 
 def creeping(paths: tuple[Path, ...], found: VarianceFinding) -> F1:
-    """Return 1 for ball-bar readings that a stick-slip makes scatter (`GATE`), else 0, stacked over the runs, shape (n,)."""
+    """Return 1 for ball-bar readings to which a stick-slip adds scatter (`GATE`), else 0, stacked over the runs, shape (n,)."""
     axis, fast_mm_s = AXES.index(found.key), GATE * found.parameters["v_c"]
     moves = (float(p.kind == "bar" and np.ptp(p.at.q_mm[:, axis]) > 0) for p in paths)
     return np.concatenate([(np.abs(p.at.v_mm_s[:, axis]) < fast_mm_s) * m for p, m in zip(paths, moves, strict=True)])
@@ -313,10 +313,10 @@ def rough_place(paths: tuple[Path, ...], key: str) -> tuple[F1, ...]:
 def _bar_scatter(
     paths: tuple[Path, ...], rest: tuple[F1, ...], off: tuple[F1, ...], sigma_mm: tuple[float, ...], teeth: NDArray[np.bool_]
 ) -> list[VarianceFinding]:
-    """Find a rough place of the ball-bar and single wrong readings (``off`` is 1 there); if most of these lie in the place, only the place.
+    """Find a rough place of the ball-bar, and single wrong readings (``off`` is 1) unless most of them lie in the rough place.
 
-    Readings that a stick-slip makes scatter (``teeth``, stacked over the runs) do not count as wrong: a tooth of its saw-tooth that is only
-    one reading long looks like a wrong reading.
+    Readings to which a stick-slip adds scatter (``teeth``, stacked over the runs) do not count as wrong: a tooth of its saw-tooth that is
+    only one reading long looks like a wrong reading.
     """
     found = _rough_places(paths, tuple(np.clip(r, -CLIPPED, CLIPPED) for r in rest), sigma_mm)
     if found and found[0].evidence > 0.0:

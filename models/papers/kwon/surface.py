@@ -66,7 +66,7 @@ class Anova:
 
     @property
     def undefined(self) -> str:
-        """Reason why F is undefined; empty if it is not."""
+        """Reason why F is undefined; empty if F is defined."""
         return "the values do not vary beyond rounding, so F is 0/0" if np.isnan(self.f) else ""
 
     def critical(self, alpha: float = 0.01) -> float:

@@ -69,7 +69,7 @@ def matrix_eq9(points_mm: F2, origin_mm: F1) -> F2:
 
 
 def matrix_of(points_mm: F2, origin_mm: F1, z_convention: ZConvention) -> F2:
-    """Return `matrix_eq9` for ``"slide"``, `matrix_eq9_printed` for ``"workpiece"``; ValueError otherwise."""
+    """Return `matrix_eq9` for ``"slide"``, `matrix_eq9_printed` for ``"workpiece"``; any other convention raises ValueError."""
     if z_convention not in ("slide", "workpiece"):
         raise ValueError(f"z_convention {z_convention!r}: must be 'slide' or 'workpiece'")
     return matrix_eq9(points_mm, origin_mm) if z_convention == "slide" else matrix_eq9_printed(points_mm, origin_mm)

@@ -137,7 +137,7 @@ def all_helices(plan: YangPlan, *, centres: bool, lengths: Literal["none", "comm
     """Return experiment (b): helices with every bar about every origin.
 
     ``centres``: whether the cup offset of each origin is unknown. ``lengths``: bar lengths are known (``"none"``), have one unknown error
-    (``"common"``) or one each (``"each"``); ValueError otherwise.
+    (``"common"``) or one each (``"each"``); any other text raises ValueError.
     """
     unknown_lengths = {"none": 0, "common": 1, "each": len(plan.radii_mm)}
     if lengths not in unknown_lengths:

@@ -117,7 +117,7 @@ def place_text(axis: int, place_mm: F1) -> str:
 
 
 def free_corner(machine: Machine, axis: int, inner: np.ndarray[tuple[int, ...], np.dtype[np.float64]], places: tuple[F1, ...]) -> F1:
-    """The edge of the inner volume (3, 2) along an axis that is farthest from the lines at ``places``; the lowest without lines.
+    """The edge of the inner volume (3, 2) along an axis that is farthest from the lines at ``places``; without lines the lowest edge.
 
     The result is the edge's lower end, mm.
     """
