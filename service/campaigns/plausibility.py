@@ -10,20 +10,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from abbe.drivers.device_file import load
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import FixtureConsoleUrl, described_by, installed, parse_url
-from abbe.service.campaigns.device_checks import BALLBAR, CNC, LASER, check_configured, needed_by
 from abbe.service.config_schema import MachineFile
 from abbe.service.domain.schedule import Schedule
 from abbe.service.errors import AbbeError, ConfigError
-from abbe.service.sequences.check import dry_run_campaign, paced
-from abbe.service.sequences.recipes.campaigns import campaign_source, recipe_plan
-from abbe.service.sequences.steps import (
-    CampaignPlan,
-)
 from abbe.service.site import INSTRUMENTS, Site, certificates, site_of
+
+if TYPE_CHECKING:
+    from abbe.service.sequences.steps import CampaignPlan
 
 SMALL_MM, LARGE_MM = 200.0, 20_000.0
 """A longest axis outside these limits is possible but rare."""
@@ -55,7 +53,7 @@ def check_plausibility(config: MachineFile, folder: Path, today: date) -> Plausi
 def _device_files(site: Site) -> list[str]:
     """Return faults of the device files that the addresses name; no device is connected."""
     found = []
-    for role in (CNC, LASER, BALLBAR):
+    for role in ("cnc", "laser", "ballbar"):
         url = getattr(site.urls, role)
         if url is not None and installed(url) is None and (named := described_by(parse_url(url))):
             try:
@@ -74,6 +72,12 @@ def check_unattended(config: MachineFile, folder: Path) -> None:
 
 def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
     """Return the reasons why scheduled checks and their automatic follow-ups could not run: recipe, strokes, feed, devices, fixture."""
+    if not config.schedule:
+        return []
+
+    from abbe.service.sequences.check import paced
+    from abbe.service.sequences.recipes.campaigns import campaign_source, recipe_plan
+
     found = []
     for entry in config.schedule:
         found += _lines(entry, site, lambda entry=entry: recipe_plan(entry.recipe, site.machine))  # type: ignore[misc]
@@ -85,6 +89,9 @@ def unattended(config: MachineFile, site: Site, folder: Path) -> list[str]:
 
 
 def _lines(entry: Schedule, site: Site, plan: Callable[[], CampaignPlan]) -> list[str]:
+    from abbe.service.campaigns.device_checks import check_configured, needed_by
+    from abbe.service.sequences.check import dry_run_campaign
+
     try:
         made = plan()
         dry_run_campaign(site.machine, made, site.max_feed_mm_min)

@@ -13,7 +13,6 @@ from typing import Any, Literal
 from abbe.drivers import registry
 from abbe.drivers.errors import DriverError
 from abbe.drivers.links.urls import installed, parse_url, split_report, untested_remedy
-from abbe.service.campaigns.device_checks import check_sensors
 from abbe.service.campaigns.plausibility import check_plausibility
 from abbe.service.config import LoadedMachine
 from abbe.service.devices.session import lock_machine, no_console
@@ -188,6 +187,8 @@ async def _read(role: str, device: Any) -> str:
         filter(None, (who.model, who.serial_no and f"serial number {who.serial_no}", who.firmware and f"firmware {who.firmware}"))
     )
     if role == "laser":
+        from abbe.service.campaigns.device_checks import check_sensors
+
         reading = await device.peek()
         check_sensors(role, reading)
         return f"{name}; air {reading.air_temp_c:.1f} °C, {reading.air_pressure_pa / 100:.0f} hPa"
