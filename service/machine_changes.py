@@ -102,8 +102,7 @@ def changed(loaded: LoadedMachine, edits: Sequence[FileEdit]) -> LoadedMachine:
 
 
 def _value(edit: FileEdit) -> Any:
-    """The wanted value. Only in keys that hold a last day, the text of a day becomes a date. Raises ValueError, RecursionError,
-    ConfigError."""
+    """Return the wanted value; for a key that holds a last day, its text as a date. Raises ValueError, RecursionError, ConfigError."""
     value = json.loads(edit.value)
     if LOOSER.get(edit.key) != "later" or not isinstance(value, str):
         return value

@@ -288,7 +288,7 @@ class Session:
 
 
 async def no_console(text: str) -> None:
-    """Refuse a question to a person, for unattended sessions. Raises ConfigError with the question."""
+    """Raise ConfigError with the question, because nobody is at the console to answer it."""
     raise ConfigError(f"no one is at the console, but a person has to act: {text}", "run this test attended, or configure a remote fixture")
 
 

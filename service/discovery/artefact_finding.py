@@ -23,9 +23,9 @@ LEFT = 2.0
 class ArtefactFinding:
     """What a campaign of artefacts shows of part and machine.
 
-    ``rank``: the fields that the poses show, None unless one plate lay in several poses in a plane; ``shares``: shares of part and machine
-    in these fields, else empty. ``waves``: sure periods of the machine's motions. ``scatter``: scatter of the points as a multiple of their
-    repeatability.
+    ``rank``: the error fields that the poses show, None unless one plate lay in several poses in a plane; ``shares``: the part's and the
+    machine's amount of each field, empty if ``rank`` is None. ``waves``: sure periods of the machine's motions. ``scatter``: scatter of
+    the points as a multiple of their repeatability.
     """
 
     campaign: str

@@ -111,7 +111,7 @@ def _stacked(case: Case) -> tuple[F1, F1, F1]:
 def _exceeds_scatter(case: Case, found: Discovery, scatter: _Scatter) -> bool:
     """Check whether the finding shifts positions by more than their repeats allow, and every named effect exceeds its own U.
 
-    The shift is the change of the residuals by the named effects; without named effects, the residuals themselves.
+    The shift is the part of the residuals that the named effects explain, or all of the residuals if no effect was named.
     """
     if any(abs(e.strength) <= 2.0 * e.u_strength for e in found.effects):
         return False

@@ -49,7 +49,8 @@ class ReferenceSolution:
 class _Before:
     """A solution, the CRC of the table that acted while it was measured, and the effects subtracted from its readings.
 
-    ``taken``: labels of these effects; ``version``: the version of the model book that has them, None without one.
+    ``taken``: labels of these effects; ``version``: the version of the model book that has them, None if no effect was
+    subtracted.
     """
 
     number: int
@@ -110,7 +111,7 @@ def _tables_of(store: Store, record: SolutionRecord) -> list[RunTable]:
 
 
 def _acting(tables: Sequence[RunTable]) -> int | None:
-    """Return the CRC of the table that acted in all runs, given the table of each; None if none acted in any.
+    """Return the CRC of the table that acted in all runs, given the table of each; None if no table acted.
 
     Raises
     ------

@@ -44,7 +44,7 @@ def changed_text(changed: ChangedSince | None) -> str:
 
 
 def changed_lines(changed: ChangedSince | None) -> list[str]:
-    """Return `changed_text`, then alternatives, proof and limits of these runs; empty without a comparison."""
+    """Return `changed_text` and lines about rivals, proof, and changes that these runs could have missed; empty without a comparison."""
     if changed is None:
         return []
     out = [changed_text(changed)]

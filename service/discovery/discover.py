@@ -50,8 +50,8 @@ class DiscoveryJob:
     ``campaign``: as measured. ``runs``: its runs, decimated (`abbe.service.campaign_data.decimation`) and without the effect of an active
     table; ``table_mm``: this effect by run. ``case``: these runs, also without the effects of the model book's version ``base``; ``known``:
     labels of these effects; ``known_mm``: their contributions by run. ``effects``: the catalogue. ``flags``: doubtful features of single
-    runs, and effects that decimation hides. ``thinning``: the decimation in numbers, None without any. ``since``: the solution to compare
-    with.
+    runs, and effects that decimation hides. ``thinning``: the decimation in numbers, None if no run was decimated. ``since``: the
+    solution to compare with.
 
     ``expected_version``: version that must still be current when this discovery adds a version: the newest at its start, or the version
     that the continued discovery added.

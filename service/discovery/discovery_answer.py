@@ -65,5 +65,5 @@ def _next_test(test: NextTest) -> dict[str, Any]:
 
 
 def location_doc(location: Localization) -> dict[str, Any]:
-    """Return the known fields of a location, without the table of significance tests."""
+    """Return as JSON where a signal was located: the fields that are not empty, without the table of significance tests."""
     return {k: v for k, v in asdict(location).items() if k != "table" and v not in (None, (), [], "")}

@@ -1,7 +1,7 @@
 """States of a discovery and their order: FITTED, SUSPICIOUS, PROPOSED, TESTING, EXPLAINED or UNEXPLAINED.
 
 Pure functions from a finding to its steps. Every step states its reason and the rule of its decision.
-`nothing_missing`: the verdict where no effect is missing, with runs outside the fit that disagree.
+If no effect is missing, `nothing_missing` gives the verdict, and names the runs outside the fit that disagree.
 """
 
 from __future__ import annotations
@@ -167,7 +167,7 @@ def disagreeing(finding: Finding) -> list[Agreement]:
 
 
 def nothing_missing(finding: Finding) -> str:
-    """Return the verdict on a finding without missing effects; it names other runs that disagree or could not be judged."""
+    """Return the verdict on a finding without missing effects; it names the runs outside the fit that disagree or were not judged."""
     off, open_ = disagreeing(finding), _unjudged(finding)
     if not off and not open_:
         return "the present model explains all runs to their noise"

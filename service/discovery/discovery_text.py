@@ -81,7 +81,7 @@ def _capital(text: str) -> str:
 
 
 def _remainder_text(finding: Finding) -> str:
-    """Return a note if more than noise remains; empty if the finding is only scatter, which no model removes."""
+    """Return a note if the effects leave more than noise, else an empty text. Effects that only add scatter get no note."""
     gap = finding.gaps.get("identify")
     more = gap is not None and entering(finding) and gap.after_um > LEFT * gap.floor_um
     return " More than noise is left: something else is missing, too." if more else ""
@@ -94,7 +94,7 @@ def _proof_text(judged: Judgement) -> str:
 
 
 def _judging_text(gap: GapUm) -> str:
-    """Figures of runs that were never fitted. Only these state the closed share of the gap: a fit reduces the residuals of fitted runs."""
+    """Return the gap before and after as text; ``gap``: of runs outside the fit, because a fit reduces the residuals of its own runs."""
     before, after, floor = _gap_values(gap)
     share = "" if gap.closed is None else f", {max(gap.closed, 0.0):.0%} closed"
     return f"from {before} to {after} µm rms (noise alone: {floor} µm{share})"

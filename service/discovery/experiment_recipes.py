@@ -143,7 +143,7 @@ def _shrunk(helix: Helix, scale: float, place: tuple[float, float, float] | None
 
 
 def _through(place: tuple[float, float, float] | None, like: Helix, name: str) -> list[Recipe]:
-    """Return a denser helix on another sphere through ``place``; without a place, the usual second radius."""
+    """Return a denser helix on another sphere through ``place``; without a place, a helix with the usual second radius."""
     if place is None:
         return _named(like, name, "radius", radius_mm=SHORTER * like.radius_mm)
     near = _shrunk(like, SHORTER, place)

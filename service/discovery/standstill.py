@@ -80,7 +80,7 @@ def _sensors(run: Run) -> list[str]:
 
 
 def _series(run: Run, sensors: Sequence[str]) -> StandstillRun:
-    """Valid readings with all temperatures, from the first on."""
+    """Return the valid readings that have all temperatures; displacements are relative to the first of them."""
     columns = run.columns
     temperatures = np.column_stack([np.asarray(columns.further[f"temp_{name}_C"], dtype=np.float64) for name in sensors])
     reading = np.zeros(len(columns)) if run.is_sealed else columns.readings_mm

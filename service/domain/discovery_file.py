@@ -194,9 +194,9 @@ class StandstillShift(FileObject):
 class StandstillFile(FileObject):
     """The part of a machine's displacement at standstill that temperatures explain (ISO 230-3).
 
-    ``runs``: fitted runs in order of time. ``covered``: share of readings within U (k = 2) in runs left out. ``model``: the better
-    predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: predicted runs, which were not
-    fitted.
+    ``runs``: fitted runs in order of time. ``covered``: share of readings of left-out runs within U (k = 2) of their prediction. ``model``:
+    the better predictor: temperatures as they are, or their changes since the start of a run. ``predictions``: predicted runs, which
+    were not fitted.
     """
 
     format: Literal["abbe-standstill/1"]

@@ -24,16 +24,16 @@ ABOUT_BYTES = 80
 
 @dataclass(frozen=True, slots=True)
 class Loosens:
-    """Annotation of a key that a person may change on the page: ``when`` its new value allows more than the old one, which needs a reason.
+    """Annotation of a key that a person may change on the page. ``when``: which new value allows more than the old one.
 
-    A key without this annotation allows nothing.
+    A change that allows more needs a reason. No new value of a key without this annotation allows more.
     """
 
     when: Looser
 
 
 def loosening(table: type) -> dict[str, Looser]:
-    """The keys of a table of the machine file that may allow more, as dotted names, e.g. ``needs.idle``."""
+    """Return, for each annotated key of a table of the machine file (dotted, e.g. ``needs.idle``), which new value allows more."""
     found: dict[str, Looser] = {}
     for key, hint in get_type_hints(table, include_extras=True).items():
         for one in getattr(hint, "__metadata__", ()):

@@ -36,8 +36,9 @@ class CommandedPath:
     """The path of a ball-bar run, a polyline at constant feed.
 
     ``points_mm``: shape (n, 3), from the machine's position at the start of the path; ``measured``: numbers of the first and last point
-    between which readings are used, None: all. A path that was interrupted and resumed (`abbe.service.sequences.resume_plan`) begins
-    ``offset_mm`` behind the start of the whole path, and the readings of the interrupted ``pieces`` belong to it.
+    between which readings are used, None: all. If the path resumes an interrupted one (`abbe.service.sequences.resume_plan`), it is the
+    rest of the whole path: it begins ``offset_mm`` after the start of the whole path, and ``pieces`` are the interrupted runs of the
+    earlier parts.
     """
 
     points_mm: F2

@@ -125,8 +125,8 @@ class JobState:
     ``kept``, ``rolled back``, ``refused``, ``stopped``, ``failed`` or ``open`` for a push; ``proposed``, ``ended``, ``failed`` or
     ``stopped`` for a campaign or an investigation. A rollback is a push of the previous table: ``kept`` means that this table is in
     force again. While it is ``asking``, a person has to do what ``ask`` says and confirm the number ``prompt``. ``who``:
-    empty if no person ordered it. ``alarm``: the alarm for which it works, None without one. ``solution``, ``proposal``: results of a
-    campaign in the store.
+    empty if no person ordered it. ``alarm``: the alarm for which it works; None: it works for no alarm. ``solution``, ``proposal``: results
+    of a campaign in the store.
     """
 
     id: Word

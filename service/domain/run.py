@@ -188,7 +188,7 @@ class Setup:
         return replace(self, t_set_s=t_set_s, document=self.document | {"t_set_s": t_set_s})
 
     def noted(self, **facts: Any) -> Self:
-        """The same set-up with these keys of its document, which have no field."""
+        """The same set-up with these keys added to its document; none of them has a field."""
         return replace(self, document=self.document | facts)
 
     def named(self, setup_id: str) -> Self:

@@ -95,5 +95,5 @@ def _table(file: TextFile, axis: str, rows: F1) -> AxisTable:
     way = 1 if rows[1, 0] > rows[0, 0] else -1
     position, there, back = (rows[::way, k] for k in range(3))
     if not (np.diff(position) > 0).all():
-        raise file.wrong(6, "positions go forward and back")
+        raise file.wrong(6, "the positions turn back, expected all rising or all falling")
     return AxisTable(axis, axis, position, SIGN.from_file(there, position), SIGN.from_file(back, position))

@@ -39,7 +39,7 @@ class ControlModel:
     motions_format : str
         Format of the error motions from which the control computes corrections by its own kinematic chain.
     lines_format, squareness, lost_motion : str, bool, bool
-        Format of commands, and what they hold.
+        Format of commands; whether they can hold squareness; whether they can hold lost motion.
     lookup : str
         Position at which the control looks up all tables but the own-axis ones.
     unit_mm : float

@@ -70,7 +70,7 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
     if not rows:
         raise file.wrong(1, "the file is empty: LinuxCNC would not compensate at all")
     if len(rows) > LIMITS.points:
-        raise file.wrong(lines[LIMITS.points], f"LinuxCNC takes {LIMITS.points} points and leaves out the rest")
+        raise file.wrong(lines[LIMITS.points], f"{len(rows)} points: LinuxCNC takes {LIMITS.points} and leaves out the rest")
     increasing(file, [r[0] for r in rows], lines)
     position = np.array([r[0] for r in rows])
     there, back = (SIGNS[kind].from_file(np.array([r[k] for r in rows]), position) for k in (1, 2))

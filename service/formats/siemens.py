@@ -36,7 +36,7 @@ class Assignments:
     def values(self, name: str, *index: str, places: int = 1) -> F1:
         """Return the values of all points of a table, in the order of their numbers from 0.
 
-        ``index`` holds the variable's other indices; the point's number is the index at ``places`` (from 0).
+        ``places``: place of the point's number among the variable's indices, from 0; ``index``: the other indices.
 
         Raises
         ------

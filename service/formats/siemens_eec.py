@@ -59,7 +59,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
             continue
         numbers = found.values("AA_ENC_COMP", "0", name)
         if found.number("AA_ENC_COMP_IS_MODULO", "0", name) != 0:
-            raise found.file.wrong(found.line[("AA_ENC_COMP_IS_MODULO", ("0", name))], "modulo is for rotary axes")
+            raise found.file.wrong(found.line[("AA_ENC_COMP_IS_MODULO", ("0", name))], "modulo is set: the table is for a rotary axis")
         step, first, last = (found.number(f"AA_ENC_COMP_{w}", "0", name) for w in ("STEP", "MIN", "MAX"))
         position = grid(found, numbers.size, step, first, last, ("AA_ENC_COMP_MAX", f"0,{name}"))
         value = SIGN.from_file(numbers, position)

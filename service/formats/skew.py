@@ -91,7 +91,9 @@ def _factors(comp: Compensation, dialect: SkewProgram) -> tuple[float, float, fl
         line = np.polyfit(t.position_mm, t.forward_mm, 1)
         if (t.axis, t.output) not in slope or t.directional or np.abs(np.polyval(line, t.position_mm) - t.forward_mm).max() > STRAIGHT_MM:
             raise FormatRefused(
-                f"{dialect.what}, table {t.name}: only straight lines of X over Y, X over Z and Y over Z fit", f"give squareness; {NOTHING}"
+                f"{dialect.what}, table {t.name}: the program can hold only straight lines of X over Y, X over Z and Y over Z, the same in "
+                "both directions",
+                f"give squareness; {NOTHING}",
             )
         slope[(t.axis, t.output)] = float(line[0])
     xy, xz, yz = (SIGN.per_error * -v + 0.0 for v in slope.values())
@@ -121,7 +123,7 @@ _COMMANDS = {MARLIN.what: _marlin, KLIPPER.what: _klipper, GRBLHAL.what: _grblha
 
 
 def read(files: tuple[TextFile, ...], settings: FormatSettings, *, dialect: SkewProgram) -> Compensation:
-    """Read the commands as the program does; lines are zero at the reference.
+    """Read the commands as the program does; the straight lines of squareness are zero at the reference.
 
     Raises
     ------
@@ -131,7 +133,7 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings, *, dialect: Skew
         No machine was given: the commands have no range.
     """
     if settings.machine is None:
-        raise FormatRefused(f"{dialect.what}: the commands hold for the whole stroke, and no machine is given", "give the machine")
+        raise FormatRefused(f"{dialect.what}: the commands do not state the strokes, and no machine is given", "give the machine")
     file, found = files[0], dict[str, float]()
     for line, text in file.lines():
         bare = text.partition(";")[0].strip()

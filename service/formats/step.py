@@ -63,6 +63,6 @@ def step_of(form: Format, machine: Machine, axis: int, reference_mm: F1) -> Step
 
 
 def _at(grid: F1, reference: float) -> int:
-    """Index of the point of the step: the middle, or the next one if the reference lies in a cell beside it."""
+    """Index of the point of the step: the middle one, or the next one if the reference is less than a spacing away from the middle."""
     middle = grid.size // 2
     return middle if abs(reference - grid[middle]) >= np.ptp(grid) / (grid.size - 1) - 1e-9 else middle + 1

@@ -171,7 +171,7 @@ def with_unknown_table(solution: JointSolution) -> JointSolution:
 
 
 def reading_patterns_mm(solution: JointSolution) -> F2:
-    """Return what each drawn table does to the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
+    """Return what each table drawn at random does to the readings beyond smooth corrections, mm, shape (readings, TABLES)."""
     rng = np.random.default_rng(SEED)
     machine, terms = solution.machine, smooth_terms(ORDER)
     x, y, z = (max(2, round(length / SPACING_MM)) for length in machine.length_mm)
@@ -209,8 +209,9 @@ class RemovedEffects:
     """A campaign without the effects that tables cannot correct.
 
     ``labels``: the subtracted effects; ``lines``: every effect that a table cannot correct, with its remedy, or why the model book was not
-    used; ``version``: version of the model book, None without one; ``in_force``: the active table whose side effects were subtracted
-    (`remove_table`), None without one; ``not_removed``: why the side effects of a table remain in the readings, empty if none remain.
+    used; ``version``: version of the model book, None if there is no book; ``in_force``: the active table whose side effects were
+    subtracted (`remove_table`), None: no side effects were; ``not_removed``: why the side effects of a table remain in the readings, empty
+    if none remain.
     """
 
     campaign: Campaign
@@ -222,7 +223,7 @@ class RemovedEffects:
 
     @property
     def doc(self) -> dict[str, Any]:
-        """Part of a solution's document; empty without a book and without a table."""
+        """The keys about these effects in a solution's document; empty if there is neither a model book nor an active table."""
         doc: dict[str, Any] = {} if self.in_force is None else {"table_taken_out": self.in_force.model_dump(mode="json")}
         doc |= {"table_not_taken_out": self.not_removed} if self.not_removed else {}
         if self.version is None:

@@ -141,7 +141,7 @@ class Assessment:
 
     ``scale_free``: the same without the scales, for tables that do not correct scales; None unless scales are the largest part of the
     uncertainty.
-    ``left_out``: the scales that are left out of ``sources`` and its results; ``joint`` still has them.
+    ``left_out``: the scales that are left out of ``sources`` and of everything computed from them; ``joint`` still has these scales.
     """
 
     solved: Solved

@@ -162,7 +162,7 @@ def unknown_of(test: AxisReadings) -> list[str]:
 
 
 def laser_of(tests: Sequence[AxisReadings]) -> dict[str, float]:
-    """Return the laser's values for these tests: coarsest resolution, and larger uncertainties where temperatures or air are unknown."""
+    """Return the laser of the campaign file: coarsest resolution of the tests, and larger uncertainties for unknown temperatures or air."""
     out = {"resolution_mm": max(test.resolution for test in tests)}
     if any(f"temp_{test.axis.lower()}_C" not in test.further for test in tests):
         out["u_scale_temperature_k"] = float(U_SCALE_TEMPERATURE_K)

@@ -120,7 +120,7 @@ def _elements(file: TextFile, data: bytes) -> list[_Element]:
             stack[-1].parts.append(words)
 
     def declared(*_: object) -> None:
-        raise file.wrong(parser.CurrentLineNumber, "a document type (DOCTYPE): entities are not read", "export the file again")
+        raise file.wrong(parser.CurrentLineNumber, "the file has a DOCTYPE, which Abbe does not read", "export the file again")
 
     parser.StartElementHandler, parser.EndElementHandler, parser.CharacterDataHandler = start, end, text
     parser.StartDoctypeDeclHandler = declared

@@ -17,6 +17,8 @@ HEAD, DATA, END = b"HEADER::\r\n", b"Data:\r\n", b"EOF::\r\n"
 SAMPLE = np.dtype("<f8")
 MOST = 1e9
 """Largest accepted number of samples, and of samples per second; no file has more."""
+LARGEST = 1e12
+"""Largest accepted size of a sample, in the file's own unit."""
 
 
 def read_rtx(name: str, data: bytes) -> Content:
@@ -38,9 +40,9 @@ def read_rtx(name: str, data: bytes) -> Content:
         what = f"{len(samples)} bytes follow, but {count} samples and EOF:: have {count * SAMPLE.itemsize + len(END)}"
         raise file.wrong(at, f"{what}: the file is cut off, or damaged", "export the file again")
     values = np.frombuffer(samples, SAMPLE, count).astype(np.float64)
-    bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) > 1e12))
+    bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) > LARGEST))
     if bad.size:
-        raise file.wrong(at, f"sample {bad[0] + 1} is {values[bad[0]]!r}", "export the file again")
+        raise file.wrong(at, f"sample {bad[0] + 1} is {values[bad[0]]:g}, expected {-LARGEST:g} to {LARGEST:g}", "export the file again")
     return Content(
         name=name,
         form="Renishaw .rtx",

@@ -19,6 +19,7 @@ from abbe.service.instrument_files.content import AxisReadings, Content, axis_of
 _POS_HEAD = re.compile(r"Position\s+(Bidirectional|Forward Directional|Reverse Directional|Backward Directional) Avg Error", re.ASCII)
 _OTHER_HEAD = re.compile(r"\s*Position\s+[A-Z]", re.ASCII)
 _WAYS = {"Bidirectional": 0.0, "Forward Directional": 1.0, "Reverse Directional": -1.0, "Backward Directional": -1.0}
+_NAMES = {0.0: "bidirectional", 1.0: "forward", -1.0: "reverse"}
 _REN_HEAD = re.compile(r"No\.\s+Axis position\s+Combined", re.ASCII)
 _REN_FACTS = {"compensation spacing": "spacing", "compensation start": "start", "compensation end": "end"}
 """Words with which a line of a .REN begins, and the field of `_Grid` that the line gives."""
@@ -81,7 +82,7 @@ def _pos_tables(file: TextFile) -> tuple[dict[float, Table], dict[str, str], int
             said[" ".join(key.split()).lower()] = value.strip()
     for way, table in tables.items():
         if len(table[0]) < 2:
-            raise file.wrong(line, f"the table {way:+g} has {len(table[0])} rows, expected two or more: the file is cut off")
+            raise file.wrong(line, f"the {_NAMES[way]} table has {len(table[0])} rows, expected two or more: the file is cut off")
     return tables, said, line
 
 

@@ -63,7 +63,7 @@ class Ended:
 
     @property
     def settled(self) -> bool:
-        """Nothing is left to do, or only a person can do it."""
+        """Whether nothing is left to do, or only a person can do the rest."""
         return self.state is None or self.state in TERMINAL
 
 

@@ -203,7 +203,7 @@ def _activate(f: PushFacts, known: PushKnowledge) -> Operation:
 
 
 def _confirm(f: PushFacts, known: PushKnowledge) -> Operation | None:
-    """Confirm that the new table is active and byte for byte the approved one. None: the table differs, or nothing can be shown."""
+    """Next operation to confirm that the active table is, byte for byte, the approved one. None: it differs, or this cannot be shown."""
     if known.unanswered >= MAX_UNANSWERED:
         return None
     if known.start is not None and (in_force(f, known.start) != "candidate" or known.start.boot != f.boot):

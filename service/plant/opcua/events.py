@@ -24,7 +24,7 @@ class News:
     Facts hold only the newest alarms. If an alarm leaves the full list, an older one returns to the list and is not new. An alarm has the
     time at which its check began, so alarms may arrive out of order.
 
-    ``since``: a check that ended before this time is not new, nor is an alarm in the first facts that was raised before it.
+    ``since``: checks that ended before this time are not new. Alarms of the first facts that were raised before this time are not new.
     """
 
     def __init__(self, since: datetime) -> None:
