@@ -32,14 +32,16 @@ ROUNDS = 3
 """Maximum number of repetitions of the search, each with noise and simulation refitted together with the findings."""
 
 
-def scattered(problem: WhitenedProblem, picks: Sequence[Pick]) -> tuple[VarianceFinding, ...]:
-    """Find variance effects in the residuals of simulation and ``picks``; single laser outliers are included here."""
+def scattered(problem: WhitenedProblem, picks: Sequence[Pick], known: Sequence[VarianceFinding]) -> tuple[VarianceFinding, ...]:
+    """Find variance effects in the residuals of simulation and ``picks``, beside ``known`` ones; laser outliers are included here."""
     solved = solve(problem, picks)
     white = whole_rest(problem, solved)
     sigma = tuple(problem.colours[k].sd_mm for k in problem.kinds)
     leverage = tuple(problem.by_run(problem.projection.leverage))
     alone = tuple(problem.by_run(1.0 - problem.lone(white * problem.sd_mm())))
-    return extra_variance(problem.paths, tuple(problem.by_run(white)), sigma, leverage=leverage, colours=problem.colours, alone=alone)
+    return extra_variance(
+        problem.paths, tuple(problem.by_run(white)), sigma, leverage=leverage, colours=problem.colours, alone=alone, known=known
+    )
 
 
 def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
@@ -125,7 +127,7 @@ def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progre
         tell("comparing again what is left", 0.5 + 0.15 * i)
         labels = {f.pick.label for f in found} | {f.label for f in loud}
         named = [f.pick for f in found if not f.pick.unnamed]
-        loud, known = _merged(loud, scattered(problem, named)), len(loud)
+        loud, known = _merged(loud, scattered(problem, named, loud)), len(loud)
         if renewed := i == 0 or labels != _labels(found, loud):
             contest.banks.clear()  # they would take as much memory as those of the new problem
             problem = without(settled(problem, [f.pick for f in found]), loud[known:])

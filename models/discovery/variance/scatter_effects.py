@@ -17,9 +17,11 @@ from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Localization
 from abbe.models.discovery.instrument_noise import Colour
 from abbe.models.discovery.localization import localize_signal
+from abbe.models.discovery.variance.creeping_axis import at_standstill, creep_speed, scatter_along, without_band
 from abbe.models.discovery.variance.spectrum import (
     ALIKE,
     FEW,
+    SpectralLine,
     fast,
     gated_roughness,
     line_of_axis,
@@ -66,8 +68,9 @@ OVERSHADOWS = 3.0
 explained. A second vibration of less than about 0.6 of the first's size is therefore not named."""
 GATE = 1.3
 """Readings below this multiple of the stick-slip speed scatter."""
-SAW_P = 0.05
-CREEP_MM_S = 4.5
+SAW_P, TOOTH = 0.05, 0.5 * np.pi
+"""`SAW_P`: a line is a saw-tooth if noise has as much power at its harmonics with at most this probability. `TOOTH`: half height of a
+saw-tooth, in amplitudes of its first wave."""
 
 
 def bound_to_places(q_mm: F2, rest: F1, off: NDArray[np.bool_]) -> tuple[float, F1]:
@@ -169,6 +172,7 @@ def extra_variance(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
     alone: tuple[F1, ...] | None = None,
+    known: Sequence[VarianceFinding] = (),
 ) -> tuple[VarianceFinding, ...]:
     """Find variance effects with positive evidence that no stronger effect explains; per axis at most one of vibration and stick-slip.
 
@@ -185,13 +189,16 @@ def extra_variance(
         Noise with which the residuals were whitened; default: white noise.
     alone : one array (n,) per run, optional
         1 for single wrong readings (`abbe.models.discovery.instrument_noise.lone`); a ball-bar's are tested as outliers and rough places.
+    known : findings from before, with other residuals
+        Readings that a stick-slip among them makes scatter are not tested as outliers.
 
     Returns
     -------
     tuple of VarianceFinding
         Evidence above zero only, highest first.
     """
-    found = [f for f in candidates(paths, whitened, sigma_mm, leverage=leverage, colours=colours, alone=alone) if f.evidence > 0]
+    tried = candidates(paths, whitened, sigma_mm, leverage=leverage, colours=colours, alone=alone, known=known)
+    found = [f for f in tried if f.evidence > 0]
     out: list[VarianceFinding] = []
     for finding in sorted(found, key=lambda f: -f.evidence):
         if finding.name in DRIVES and any(_overshadows(o, finding) for o in out):
@@ -219,6 +226,7 @@ def candidates(
     leverage: tuple[F1, ...] | None = None,
     colours: Mapping[str, Colour] | None = None,
     alone: tuple[F1, ...] | None = None,
+    known: Sequence[VarianceFinding] = (),
 ) -> tuple[VarianceFinding, ...]:
     """Return all variance effects with their evidence, which may be negative; parameters as in `extra_variance`."""
     even = _studentised(whitened, leverage)
@@ -231,9 +239,9 @@ def candidates(
         quick = tuple(fast(p, r) for p, r in zip(bar_paths, kept, strict=True))
         for axis in range(3):
             out += _vibration(axis, bar_paths, quick, sigma, (colours or {}).get("bar"))
-        sticking = _stick_slip(bar_paths, kept, sigma)
-        teeth = np.any([np.zeros(sum(p.n for p in bar_paths)), *(creeping(bar_paths, f) for f in sticking if f.evidence > 0.0)], axis=0)
-        out += sticking
+        out += _stick_slip(bar_paths, kept, sigma)
+        sticking = [creeping(bar_paths, f) for f in (*known, *out) if f.name == "stick_slip" and f.evidence > 0.0]
+        teeth = np.any([np.zeros(sum(p.n for p in bar_paths)), *sticking], axis=0)
         out += _burst(bar_paths, kept, sigma)
         out += _bar_scatter(bar_paths, tuple(even[k] for k in bars), off, sigma, teeth)
     lasers = [k for k, p in enumerate(paths) if p.kind == "laser"]
@@ -252,6 +260,11 @@ def _studentised(whitened: tuple[F1, ...], leverage: tuple[F1, ...] | None) -> t
 def _vibration(
     axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...], colour: Colour | None
 ) -> list[VarianceFinding]:
+    """Find a vibration of an axis, or a stick-slip if the axis creeps at one speed.
+
+    At one speed, a saw-tooth in position is also one in time, with harmonics. If its teeth differ in length, the readings also scatter
+    along the axis without the vibration (`without_band`).
+    """
     line = line_of_axis(axis, paths, rest, sigma_mm, colour)
     if line is None:
         return []
@@ -260,21 +273,32 @@ def _vibration(
     location = Localization(
         location.tests, (AXES[axis],), location.directions, location.runs, period_s=1.0 / line.frequency_hz, depends_on=("time",)
     )
-    size, u, v = line.amplitude_mm * UM, line.u_mm * UM, _creep(axis, paths)
-    if v is not None and line.p_harmonics < SAW_P:
-        # at a single creeping speed a saw-tooth in position is also one in time, and its decrease with speed is unknown
-        size *= 0.5 * np.pi * np.e
-        return [VarianceFinding("stick_slip", AXES[axis], size, size, {"v_c": v}, evidence, location)]
-    return [VarianceFinding("vibration", AXES[axis], size, u, {"frequency_hz": line.frequency_hz}, evidence, location)]
+    sticks = _creeping(axis, paths, rest, sigma_mm, line, evidence, location)
+    size, u, parameters = line.amplitude_mm * UM, line.u_mm * UM, {"frequency_hz": line.frequency_hz}
+    return sticks or [VarianceFinding("vibration", AXES[axis], size, u, parameters, evidence, location)]
 
 
-def _creep(axis: int, paths: tuple[Path, ...]) -> float | None:
-    """Return the speed of an axis, mm/s, if it creeps at the same speed in all runs that move it; else None."""
-    speeds = [np.abs(p.at.v_mm_s[:, axis]) for p in paths if np.ptp(p.at.q_mm[:, axis]) > 0]
-    if not speeds:
-        return None
-    low, high = (float(np.quantile(np.concatenate(speeds), s)) for s in (0.1, 0.9))
-    return 0.5 * (low + high) if high < CREEP_MM_S and high < 1.3 * low else None
+def _creeping(
+    axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...],
+    line: SpectralLine, evidence: float, location: Localization,
+) -> list[VarianceFinding]:  # fmt: skip
+    """Return the stick-slip of an axis that creeps at one speed, if teeth explain its spectral line, or its scatter beside the line."""
+    v = creep_speed(axis, paths)
+    if v is None:
+        return []
+    beside = tuple(without_band(line.frequency_hz, axis, p, r) for p, r in zip(paths, rest, strict=True))
+    price = float(np.log(len(AXES)) + NAME_PRICE)
+    uneven = scatter_along(axis, paths, beside, sigma_mm).gain - price
+    if uneven > 0.0:
+        whole = scatter_along(axis, paths, rest, sigma_mm)
+        height, evidence = (whole.height_mm, whole.u_mm), max(whole.gain - price, uneven + max(evidence, 0.0))
+        location = replace(location, period_s=None, depends_on=())
+    elif line.p_harmonics < SAW_P:
+        height = (TOOTH * line.amplitude_mm, TOOTH * line.u_mm)
+    else:
+        return []
+    size, u, v_c = at_standstill(height[0] * UM, height[1] * UM, v)
+    return [VarianceFinding("stick_slip", AXES[axis], size, u, {"v_c": v_c}, evidence, location)]
 
 
 def _stick_slip(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> list[VarianceFinding]:

@@ -23,6 +23,9 @@ LOW_CYCLES, PER_TURN = 6.0, 2.0
 """Aliased frequencies below `LOW_CYCLES` cycles per run plus `PER_TURN` per turn of the bar count as residues of the mean model."""
 LOBES_PER_TURN = 12.0
 """Up to this many cycles per turn of the bar, a line may come from the form of balls or machine; runs in this range do not prove a line."""
+BAND = 12
+"""A vibration whose amplitude changes occupies the frequencies up to this many cycles per run from its own: in a run of 76 s its amplitude
+may swell and fade every 6 s."""
 REGULAR = 0.02
 """Sampling counts as regular when its steps differ by less than this fraction."""
 TOP = 24
@@ -70,6 +73,10 @@ class _Spectrum:
         """Return the indices in the spectrum to which physical frequencies f, Hz, are aliased."""
         return np.asarray(np.round(np.mod(f / self.rate_hz, 1.0) * len(self.size)).astype(np.intp) % len(self.size))
 
+    def folded(self, i: np.ndarray[tuple[int], np.dtype[np.intp]]) -> np.ndarray[tuple[int], np.dtype[np.intp]]:
+        """Return the indices up to half the sampling rate that have the same power."""
+        return np.asarray(np.minimum(i, len(self.size) - i))
+
 
 def line_of_axis(
     axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...], colour: Colour | None
@@ -102,13 +109,16 @@ def line_of_axis(
 
 
 def _harmonics(spectra: list[_Spectrum], f: float) -> float:
-    """Probability that noise alone has as much power at the harmonics of a line of frequency f."""
+    """Probability that noise alone has as much power at the harmonics of a line of frequency f.
+
+    A harmonic that is aliased into the band of the line (`BAND`) or onto another harmonic does not count: it has the power of the other.
+    """
     total, freedom = 0.0, 0
     for s in spectra:
-        for i in s.at(f * np.array([2.0, 3.0, 4.0])):
-            if s.energy[i] > 0:
-                total += float(2.0 * s.size[i] ** 2 / s.energy[i])
-                freedom += 2
+        line, *harmonics = (int(i) for i in s.folded(s.at(f * np.array([1.0, 2.0, 3.0, 4.0]))))
+        apart = [i for i in dict.fromkeys(harmonics) if abs(i - line) > BAND * PADDING and s.energy[i] > 0]
+        total += float(sum(2.0 * s.size[i] ** 2 / s.energy[i] for i in apart))
+        freedom += 2 * len(apart)
     return float(chi2_above(total, freedom)) if freedom else 1.0
 
 
@@ -206,7 +216,7 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
     look = np.concatenate([p.look**2 for p in paths]) / noise[:, None]
     values = np.concatenate(rest)
     read = values != 0.0
-    fits = tuple(_RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([roughness_of(r) for r in rest]), values**2))
+    fits = tuple(RoughnessFit.of(square[read], look[read]) for square in (np.concatenate([roughness_of(r) for r in rest]), values**2))
     out: dict[int, Roughness] = {}
     for axis in range(3):
         gates = {v_c: tooth_variance(paths, axis, v_c) / noise for v_c in GATES_MM_S}
@@ -217,19 +227,19 @@ def gated_roughness(paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tup
             gain = min(rough / ALIKE, raw)
             if axis not in out or gain > out[axis].gain:
                 by_run = tuple(np.split(np.sqrt(gates[v_c]), np.cumsum([p.n for p in paths])[:-1]))
-                out[axis] = Roughness(gain, float(len(GATES_MM_S)), v_c, *_height(variance, u), by_run)
+                out[axis] = Roughness(gain, float(len(GATES_MM_S)), v_c, *height(variance, u), by_run)
         if axis in out and out[axis].gain > WORTH:
             out[axis] = _averaged(out[axis], fits[1], {v_c: g[read] for v_c, g in gates.items()})
     return out
 
 
-def _height(variance: float, u: float) -> tuple[float, float]:
+def height(variance: float, u: float) -> tuple[float, float]:
     """Return the half height of a saw-tooth and its standard uncertainty from its variance."""
     size = float(np.sqrt(3.0 * variance))
     return size, 1.5 * u / max(size, 1e-12)
 
 
-def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -> Roughness:
+def _averaged(rough: Roughness, fit: RoughnessFit, gates: Mapping[float, F1]) -> Roughness:
     """Average height and speed over all gates, weighted with their likelihoods. If the axis creeps at one speed, the readings show only the
     product of both: then keep the most likely gate, with the uncertainty over all gates.
     """
@@ -237,7 +247,7 @@ def _averaged(rough: Roughness, fit: _RoughnessFit, gates: Mapping[float, F1]) -
     gains = np.array([gain for gain, _, _ in found.values()])
     weight = np.exp(gains - gains.max())
     weight /= weight.sum()
-    size, own = np.array([_height(variance, u) for _, variance, u in found.values()]).T
+    size, own = np.array([height(variance, u) for _, variance, u in found.values()]).T
     mean = float(weight @ size)
     u = float(np.sqrt(weight @ (own**2 + (size - mean) ** 2)))
     if u >= mean:
@@ -259,17 +269,18 @@ def roughness_of(rest: F1) -> F1:
 
 
 @dataclass(frozen=True)
-class _RoughnessFit:
-    """Squared residuals, and a fit of the scatter along the axes at any speed, to test gates (`Roughness`) for additional scatter."""
+class RoughnessFit:
+    """Squared residuals, and a fit of the scatter along some axes at any speed, to test gates (`Roughness`) for additional scatter."""
 
     square: F1
     plain: F2
     start: F1
 
     @classmethod
-    def of(cls, square: F1, look: F2) -> _RoughnessFit:
+    def of(cls, square: F1, look: F2) -> RoughnessFit:
+        """Fit scatter to squared residuals, shape (n,), from the relative variance that scatter along each axis adds, shape (n, axes)."""
         plain = look / np.maximum(look.max(axis=0), 1e-300)
-        return cls(square, plain, _likelihood(square, plain, np.full(3, 0.02)))
+        return cls(square, plain, _likelihood(square, plain, np.full(look.shape[1], 0.02)))
 
     def score(self, gate: F1) -> float:
         """Approximate gain of a gate, without a fit."""
@@ -278,16 +289,23 @@ class _RoughnessFit:
         return float(max(slope, 0.0) ** 2 / np.sum((gate / v) ** 2))
 
     def gain(self, gate: F1) -> tuple[float, float, float]:
-        """Fit additional variance within a gate; return gain in log likelihood, the variance and its standard uncertainty."""
+        """Fit additional variance within a gate; return gain in log likelihood, the variance and its standard uncertainty.
+
+        The gain of the `FEW` readings with most of it does not count.
+        """
+        each, variance, u = self.by_reading(gate)
+        return max(float(each.sum()) - float(np.sort(each)[-FEW:].sum()), 0.0), variance, u
+
+    def by_reading(self, gate: F1) -> tuple[F1, float, float]:
+        """Do the same as `gain`, with the gain of every reading, shape (n,)."""
         top = float(gate.max())
         full = np.column_stack([self.plain, gate / top])
         found = _likelihood(self.square, full, np.append(self.start[1:], 0.5))
         extra = 1.0 + full @ found[1:]
         before, after = self.start[0] * (1.0 + self.plain @ self.start[1:]), found[0] * extra
         each = 0.5 * (np.log(before / after) + self.square / before - self.square / after)
-        few = float(np.sort(each)[-FEW:].sum())
         u = 1.0 / np.sqrt(0.5 * float(np.sum((full[:, -1] / extra) ** 2)) + 1e-300)
-        return max(float(each.sum()) - few, 0.0), float(found[-1] * found[0] / top), float(u * found[0] / top)
+        return each, float(found[-1] * found[0] / top), float(u * found[0] / top)
 
 
 def _likelihood(square: F1, columns: F2, start: F1) -> F1:
