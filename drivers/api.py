@@ -409,7 +409,7 @@ _NO_SIGNAL = int(LaserFlag.SIGNAL_LOW | LaserFlag.NO_REFLECTOR)
 
 
 def air_doc(reading: LaserReading) -> dict[str, float]:
-    """Return air temperature and pressure of a reading as fields of its record, without those that the instrument does not measure."""
+    """Return air temperature and pressure of a reading as fields of its record; leave out what the instrument does not measure."""
     known = {"air_temp_c": reading.air_temp_c, "air_pressure_pa": reading.air_pressure_pa}
     return {name: value for name, value in known.items() if not math.isnan(value)}
 

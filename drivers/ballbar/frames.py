@@ -268,7 +268,7 @@ class Framing:
         return self._thread.is_alive()
 
     async def drained(self, within_s: float) -> bool:
-        """Wait until all bytes read so far are framed and delivered; return False if they are not within ``within_s`` seconds."""
+        """Wait until all bytes read so far are framed and delivered; return False if that takes longer than ``within_s`` seconds."""
         return await asyncio.to_thread(self.ring.drained, within_s) if self.runs else not self.ring.fill
 
     async def ended(self) -> None:

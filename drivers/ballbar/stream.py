@@ -173,7 +173,7 @@ class SequenceTracker:
         self._stray_before = False
 
     def _misfit(self, sample: BarSample, ahead: int) -> tuple[type[SegmentEnd], str]:
-        """Return why this sample cannot follow after ``ahead`` missing ones, as error class and reason; the reason is empty if it can."""
+        """Return error class and reason why this sample cannot follow after ``ahead`` missing samples; no reason: the sample can."""
         reason = self._clock_misfit(sample.device_us - self._last_us, ahead + 1)
         _, _, limit_nm, _, mask, number = self._plain_limits
         if not reason and sample.status & mask != number:

@@ -31,7 +31,7 @@ UNKNOWN: Point = (float("nan"), float("nan"), float("nan"))
 
 
 class ListenedControl:
-    """A control behind a device file. Without one (``source`` is None) its position is unknown. Its clock is this computer's."""
+    """A control behind a device file. Without a device file (``source`` is None) its position is unknown. Its clock is this computer's."""
 
     only_listens = True
 

@@ -1,6 +1,6 @@
 """A described device that sends lines of text, when asked or by itself, over a serial port or TCP.
 
-A line of text has no number and seldom a check sum, but a late answer must never be taken for the next one. So after a disturbance the
+A line of text has no number and seldom a check sum, but a late answer must never be taken for the next answer. So after a disturbance the
 line has to be silent for a whole timeout, and unsolicited bytes are dropped before a request.
 """
 

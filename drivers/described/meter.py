@@ -30,7 +30,7 @@ ZEROED_MM = 0.05
 
 
 class DescribedMeter:
-    """A displacement sensor. `zero` sends the device's own command; if there is none, later readings are relative to the present one.
+    """A displacement sensor. `zero` sends the device's own command; without such a command, later readings count from the present one.
 
     A reading is new if the device's counter or time stamp has changed. For a device with neither, a reading of registers is new if it comes
     ``update_s`` (device file) after the last new one, and a line of text is always new.
@@ -49,7 +49,7 @@ class DescribedMeter:
 
     @property
     def resolution_mm(self) -> float:
-        """Smallest step of the readings, mm: as the device file states, else one count."""
+        """Smallest step of the readings, mm: from the device file or, if this states none, one count."""
         value = self.file.values["displacement"]
         return TO_OURS[value.unit][0] * (self.file.limits.resolution or value.scale)
 
@@ -175,7 +175,7 @@ class DescribedMeter:
                 )
 
     def _counted(self, snapshot: CountSnapshot) -> int:
-        """Return the sample number of a snapshot, which never wraps: from the device's counter or time stamp, else counted here."""
+        """Return a snapshot's sample number, which never wraps: from the device's counter or time stamp or, without both, counted here."""
         if snapshot.epoch != self._epoch:
             self._epoch, self._zero_mm = snapshot.epoch, None
         soon, self._seen_s = snapshot.host_s - self._seen_s < SOON_S, snapshot.host_s

@@ -171,7 +171,7 @@ class ModbusSource:
 
 
 def span(values: Iterable[DeviceValue]) -> tuple[int, int]:
-    """Return the first register of some values, and the one after their last."""
+    """Return the first register of some values, and the register after their last register."""
     listed = [(value.address or 0, (value.address or 0) + registers(value)) for value in values]
     return min(first for first, _ in listed), max(end for _, end in listed)
 

@@ -29,7 +29,7 @@ class CountSnapshot:
 
 
 class DeviceSource(Protocol):
-    """The wire of a described device. Its methods raise what those of `abbe.drivers.described.modbus_source.ModbusSource` raise."""
+    """The wire of a described device. Its methods raise the same errors as `abbe.drivers.described.modbus_source.ModbusSource`."""
 
     name: str
     incidents: Incidents

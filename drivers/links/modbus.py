@@ -123,7 +123,7 @@ TURNS_TO_OPEN = 2
 
 
 class ModbusWire:
-    """The connection to one Modbus unit, at most one at a time."""
+    """Connects to one Modbus unit; opens at most one connection at a time."""
 
     def __init__(self, url: ModbusTcpUrl | ModbusRtuUrl) -> None:
         self._url = url

@@ -255,7 +255,7 @@ class ModbusLink:
     timeout_s : float
         Longest wait for one reply; a TCP connection may take three times as long.
     canary : Canary, optional
-        For devices that have a canary and answer function 4 like function 3 (docs/protocols). Without one, a disturbed RTU line is not
+        For devices that have a canary and answer function 4 like function 3 (docs/protocols). Without a canary, a disturbed RTU line is not
         verified, and there is no heartbeat.
     heartbeat_s : float, optional
         Idle time until the canary is read (None: never). This read detects a vanished peer within ``heartbeat_s + timeout_s``.

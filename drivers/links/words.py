@@ -105,7 +105,7 @@ _STANDS_S = 1.0
 
 
 def _order(known: int, found: int) -> str:
-    """Return the byte order (``"CDAB"``, ...) in which the known value reads as the found one; empty if there is none."""
+    """Return the byte order (``"CDAB"``, ...) that turns the known value into the found value; empty if no order does."""
     data = known.to_bytes(4, "big")
     return next((name for name, places in _ORDERS.items() if bytes(data[i] for i in places) == found.to_bytes(4, "big")), "")
 

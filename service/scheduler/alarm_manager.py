@@ -104,7 +104,7 @@ class AlarmManager(RetryingStore):
         self._checked_again: set[tuple[int, int]] = set()
 
     async def checked(self, doc: Doc, number: int) -> str:
-        """Compare a stored verification with earlier ones; raise, keep or clear its recipe's alarm. Return a sentence or an empty text."""
+        """Compare a stored verification with earlier ones; raise, keep or clear its recipe's alarm. Return the effect as text, or empty."""
         recipe, warn_days = doc["recipe"], self.duties.warn_days
         records = await self._read(self._store.verifications.of_machine, self._machine, READ_CHECKS)
         looked = await self._read(evaluate_alarm, self._store, self._machine, recipe, records, warn_days)

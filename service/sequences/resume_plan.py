@@ -319,7 +319,7 @@ def rest_of(
 
 
 def _along_path(test: TestPlan, first: int, start: Point | None, so_far: ReadProgress) -> Rest | None:
-    """Return the rest of a test that resumes in the middle of its path; None if it cannot."""
+    """Return the rest of a test that resumes in the middle of its path; None if the test cannot resume there."""
     steps = _by_itself(test.steps[first:])
     k = next((k for k, step in enumerate(steps) if isinstance(step, RecordPath)), None)
     path = None if k is None else steps[k]
@@ -369,7 +369,7 @@ def _all_axes_from(trail: tuple[Point, ...]) -> int:
 
 
 def way_back(resume_trail: ResumeTrail, position_mm: Point) -> tuple[Point, ...]:
-    """Return the positions to pass through from the current one. Raises SetupDisturbed if the machine is not on the way it came."""
+    """Return the positions to pass through on the way back. Raises SetupDisturbed if the machine stands off the way that it came."""
     if not resume_trail.trail:
         return ()
     trail, here = np.array(resume_trail.trail), np.array(position_mm)
@@ -446,7 +446,8 @@ def _feed(steps: tuple[Step, ...]) -> float:
 def _nearest(trail: np.ndarray, here: np.ndarray, to: int, *, latest: bool) -> tuple[int, float]:
     """Return the number of the nearest segment's first point, and the distance from the segment, mm.
 
-    Of several passages (a circle with feed-in) take the last one if ``latest``, else the one nearest to ``to`` along the trail.
+    If the trail passes ``here`` several times (a circle with feed-in), ``latest`` takes the last passage; without ``latest`` the passage
+    nearest to ``to`` along the trail counts.
     """
     if len(trail) == 1:
         return 0, float(np.linalg.norm(here - trail[0]))

@@ -271,7 +271,7 @@ class Runner:
     async def _same_artefact(
         self, references: tuple[TouchFeature, ...], carried: tuple[dict[str, Any], ...], recorder: Recorder, watch: Watch
     ) -> Point:
-        """Touch the references again: only equal ones prove an undisturbed stylus and artefact. Then keep the earlier features."""
+        """Touch the references again: only equal results prove an undisturbed stylus and artefact. Then keep the earlier features."""
         self._references = references
         await self._requalified(watch)
         for one in carried:

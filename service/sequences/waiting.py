@@ -58,7 +58,7 @@ LOOK_S = 0.1
 async def paused(
     session: Session, control: Control, watching: Watching, expected: ExpectedTable | None, journal: Journal, *, beam: bool = False
 ) -> bool:
-    """Wait until the pause is withdrawn and all preconditions hold; an unmet one is reported, and the pause continues.
+    """Wait until the pause is withdrawn and all preconditions hold; an unmet precondition is reported, and the pause continues.
 
     Where no pause is allowed (`Control.no_pause_reason`) an unmet precondition ends the run: a closed door alone, without a person's
     confirmation, must not start motion.

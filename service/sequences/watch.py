@@ -122,7 +122,7 @@ class Watch:
             await self._rest(self._w.period_s if self.beam else AIR_PERIOD_S)
 
     async def named(self, error: BaseException) -> BaseException:
-        """Return the cause of a device error: the interlock if one holds, else the error itself."""
+        """Return the cause of a device error: the interlock that is tripped now or, if there is none, the error itself."""
         if not isinstance(error, DriverError | MeasurementFault) or isinstance(error, Rebooted):
             return error
         try:

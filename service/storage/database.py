@@ -93,7 +93,7 @@ class Database:
 
     @property
     def is_postgresql(self) -> bool:
-        """Whether a PostgreSQL server stores the data; otherwise it is SQLite."""
+        """Whether a PostgreSQL server stores the data; False: SQLite does."""
         return self.engine.dialect.name == "postgresql"
 
     def now(self) -> str:

@@ -48,7 +48,7 @@ def private_file(path: Path) -> int:
 
 
 def readable_by_others(path: Path) -> str:
-    """Return a warning if accounts other than the owner may use a file; empty if not, or if the file or POSIX rights are missing."""
+    """Return a warning if accounts other than the owner may use a file; empty for a private or missing file, or without POSIX rights."""
     try:
         rights = stat.S_IMODE(path.stat().st_mode)
     except OSError:

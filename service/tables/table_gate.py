@@ -122,7 +122,7 @@ def _remedy(site: Site, push: PushedTable) -> str:
 
 
 async def accept_strange(controller: TableController, store: Store, site: Site, by: str) -> str | None:
-    """Accept the table in force if this database did not push it into this control; return a sentence about it, else None.
+    """Accept the table in force if this database did not push it into this control; return a sentence about that, None if it was pushed.
 
     An unverified table that this database pushed is not accepted here: `abbe accept-table` can do that.
     """

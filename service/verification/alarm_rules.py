@@ -64,7 +64,7 @@ def _of_figure(one: FigureTrend, records: Sequence[VerificationRecord], terms: A
 
 
 def _before(one: FigureTrend, records: Sequence[VerificationRecord], terms: AlarmTerms) -> tuple[float, float] | None:
-    """Reference for a jump (value, standard uncertainty): ``terms.compare``, else the mean of earlier checks if they are few, else None."""
+    """Reference for a jump (value, standard uncertainty): ``terms.compare``, or the mean of a few earlier checks; None: no reference."""
     kept = (terms.compare or {}).get(one.figure)
     if kept is not None:
         return kept

@@ -118,7 +118,7 @@ def deviations(machine_path: Path, errors_path: Path, points_path: Path, *, exac
 
 
 def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact: bool) -> tuple[F2, F2 | None]:
-    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), in blocks, to bound the memory for a million points."""
+    """Deviation, shape (n, 3), and uncertainties, shape (n, 4), mm; in blocks, to bound the memory for a million points."""
     at = Points(points.axes_mm, points.direction, points.tool_mm)
     u: F2 | None = None if known.covariance is None else np.empty((points.axes_mm.shape[0], 4))
     off = _deviation(machine, known, at, exact=exact)
@@ -133,7 +133,7 @@ def _evaluate(machine: Machine, known: KnownErrors, points: PointsFile, *, exact
 
 
 def _deviation(machine: Machine, known: KnownErrors, at: Points, *, exact: bool) -> F2:
-    """Deviation, shape (n, 3): as a field where all points have one tool and no direction, else point by point, in blocks."""
+    """Deviation, shape (n, 3), mm: as a field if all points have one tool and no direction; if not, point by point, in blocks."""
     if not exact and at.direction is None and at.tool_mm is None:
         return field_mm(machine, known.motions.motions, at.axes_mm)
     off: F2 = np.empty((at.axes_mm.shape[0], 3))

@@ -81,9 +81,10 @@ class Way:
 
 
 def scale_temperature(runs: Sequence[Run], axis: str, material: AxisMaterial | None) -> ScaleTemperature | None:
-    """Temperature of an axis' scale during a test: mean of its sensor if every run recorded it, else the stated one, else None.
+    """Temperature of an axis' scale during a test: mean of its sensor if every run recorded it, or as the machine file states it.
 
-    The recorded range is added to the stated uncertainty, as a rectangular distribution. None, too, if the sensor was out of bounds.
+    The recorded range is added to the stated uncertainty, as a rectangular distribution. None: neither is known, or the sensor was out of
+    bounds.
     """
     if _out_of_bounds(runs, axis):
         return None
@@ -121,7 +122,7 @@ def _column(axis: str) -> str:
 
 
 def _out_of_bounds(runs: Sequence[Run], axis: str) -> str:
-    """Return the recorded temperature of an axis' scale that exceeds the bounds of a stated one; empty if none does."""
+    """Return a text about a recorded scale temperature outside `COLDEST_C` to `WARMEST_C`; empty if there is none."""
     for run in runs:
         values = _recorded(run, _column(axis))
         beyond = values[(values < COLDEST_C) | (values > WARMEST_C)]
@@ -158,7 +159,7 @@ def reduction_of(runs: Sequence[Run], axis: str, materials: Mapping[str, AxisMat
     axis : str
         X, Y or Z.
     materials : mapping
-        By axis, from the machine file; empty without one.
+        By axis, from the machine file; empty without a machine file.
     """
     material = materials.get(axis)
     bad = _out_of_bounds(runs, axis)

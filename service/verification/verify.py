@@ -297,7 +297,7 @@ def _air(runs: list[Run], window: tuple[float, float]) -> list[str]:
 
 
 def _outside(runs: list[Run], window: tuple[float, float]) -> float | None:
-    """Return the air temperature farthest outside the window; None if all are inside or none was measured."""
+    """Return the air temperature, °C, farthest outside the window; None if all are inside or none was measured."""
     low, high = window
     temperatures = [float(t) for r in runs for t in r.columns.air_c]
     worst = max(temperatures, key=lambda t: max(low - t, t - high), default=None)

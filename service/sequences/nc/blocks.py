@@ -199,7 +199,7 @@ def _by_hand(step: Step) -> str:
 
 
 def _path(test: TestPlan, step: RecordPath, arcs: tuple[str, ...]) -> Iterator[Block]:
-    """Yield the blocks of a path: exact arcs for a circle, else the polyline."""
+    """Yield the blocks of a path: exact arcs for a circle, the polyline for any other path."""
     plane = test.bar.plane
     if test.test != "ballbar_circle" or plane not in arcs:
         yield from (Go(p, step.feed_mm_min) for a, p in pairwise(step.points_mm) if p != a)

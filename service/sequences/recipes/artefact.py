@@ -192,7 +192,7 @@ class ArtefactTest(TestRecipe):
 
 
 def verifying_poses(machine: Machine, name: str, recipes: tuple[object, ...]) -> CampaignPlan:
-    """Return the poses of a recipe as a verification: runs that no solution uses. Raises ConfigError if it holds other tests, or none."""
+    """Return the poses of a recipe as a verification: runs that no solution uses. Raises ConfigError for other tests or no test."""
     poses = [r for r in recipes if isinstance(r, ArtefactTest)]
     if not poses or len(poses) < len(recipes):
         raise ConfigError(f"recipe {name}: a verification by poses allows only tests of kind 'artefact'", "leave the other tests out")

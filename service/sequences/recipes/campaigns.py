@@ -197,7 +197,7 @@ def split_recipe_name(name: str) -> tuple[str, int]:
 
 
 def is_full(recipe: str, names: tuple[str, ...]) -> bool:
-    """Return whether a recipe is one of the full campaigns ``names``. Only the built-in one takes a ball-bar rate; a file sets its own."""
+    """Return whether a recipe is one of the full campaigns ``names``. Only the built-in one takes a ball-bar rate; files state theirs."""
     name, rate_hz = split_recipe_name(recipe)
     return name in names and (name == IDENTIFICATION or rate_hz == USUAL_HZ)
 
