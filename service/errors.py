@@ -488,7 +488,7 @@ def mistakes(errors: Iterable[ErrorDetails]) -> list[Mistake]:
 
 
 def and_more(errors: Sequence[Mistake]) -> str:
-    """Return how many mistakes there are besides the first; empty for none."""
+    """Return text that counts the mistakes after the first; empty if there are none."""
     return f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
 
 

@@ -20,7 +20,7 @@ from abbe.service.sequences.control import Suspending, Watching
 class Site:
     """Facts about a machine that a job needs. ``doc``: the machine object (docs/schemas/machine.schema.json).
 
-    ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``; one without a certificate is absent.
+    ``calibrated_until``: last day of the certificate of ``ballbar``, ``laser``, ``artefact``, as far as there is a certificate.
     ``two_people``: a proposed table is only pushed after approval by a person other than its proposer. ``materials``: expansion and
     stated temperature of the scales by axis. ``room_c``: range of the air temperature that a person states for a machine without a
     laser, by the room's own thermometer; valid until the day ``room`` of ``calibrated_until``.

@@ -284,7 +284,7 @@ class AuditBook:
 
 
 def heads_in(file: Path) -> list[Anchor]:
-    """Return the heads in a file, in their order; empty without a file.
+    """Return the heads in a file, in their order; an empty list if there is no file.
 
     Raises
     ------
@@ -314,7 +314,7 @@ def sqlite_base(database: Path) -> str:
 
 
 def _sqlite_files_base(store: Store | None, database: Path) -> str:
-    """Return the path of `sqlite_base`, or the path of earlier versions if the key there sealed this database's last record."""
+    """Return the path of `sqlite_base`, or that of earlier versions of Abbe, if the key there sealed the last record."""
     base, folder = sqlite_base(database), os.environ.get(ENVIRONMENT)
     if store is None or not folder or files_of(base)[0].exists():
         return base
@@ -391,7 +391,7 @@ def files_base(store: Store | None, url: str) -> str | None:
 def _anchor(line: str) -> Anchor | None:
     """Parse a line of the heads file; None for a line cut short by a power cut.
 
-    An attacker gains nothing by such a line: removing it does the same.
+    Such a line helps no attacker: to cut a line short does no more than to remove it.
     """
     parts = line.split(" ")
     if len(parts) == 3 and parts[0].isdigit() and [len(part) for part in parts[1:]] == [64, 64] and len(parts[0]) < 18:

@@ -83,12 +83,12 @@ class BackupList:
 
     @property
     def bytes(self) -> int:
-        """Size of the backup."""
+        """Size of the backup, bytes."""
         return sum(one.bytes for one in self.files.values()) + (0 if self.pieces is None else self.pieces.bytes)
 
     @property
     def new_bytes(self) -> int:
-        """Size of the parts that no earlier backup holds."""
+        """Size of the parts that no earlier backup holds, bytes."""
         return self.bytes - (0 if self.pieces is None else self.pieces.bytes - self.pieces.new_bytes)
 
 
@@ -115,7 +115,10 @@ def digest_of(path: Path) -> str:
 
 
 def file_list(folder: Path) -> dict[str, ListedFile | None]:
-    """Return the files below a folder by relative path, except list and pieces; None for a link, pipe or device. Raises OSError."""
+    """Return size and digest of each file below a folder by its relative path, without list and pieces; a link, pipe or device has None.
+
+    Raises OSError.
+    """
     found = dict[str, ListedFile | None]()
     for path in sorted(folder.rglob("*")):
         if path.parent == folder / PIECES:
@@ -139,7 +142,7 @@ def read_backup(folder: Path) -> Backup:
         doc = json.loads(read_plain(folder / LIST, LONGEST_LIST))
         if doc.get("format") not in {FORMAT, SHARED_FORMAT}:
             known = f"this version of Abbe reads {FORMAT} and {SHARED_FORMAT}"
-            raise BackupRefused(f"{folder} is a backup of the format {doc.get('format')!r}", known)
+            raise BackupRefused(f"{folder} cannot be read: its format is {doc.get('format')!r}", known)
         listed = record(BackupList, doc, f"{folder / LIST}")
         wanted, found = listed.files, file_list(folder)
         wrong = sorted(name for name in wanted.keys() | found.keys() if name not in wanted or wanted[name] != found.get(name))
@@ -193,7 +196,7 @@ SERVER_HELP = "copy it with pg_dump --format=custom, bring it back with pg_resto
 
 @dataclass(frozen=True, slots=True)
 class BackupSource:
-    """Parts of a backup: the database, the capture's folder of samples not yet in it, and optionally the machine file."""
+    """What a backup copies: the database, samples of the capture that are not in it yet, and optionally the machine file."""
 
     url: str
     capture: CaptureSettings
@@ -210,9 +213,11 @@ def sqlite_file(url: str, what: str) -> Path:
     """
     parsed = parse_url(url)
     if parsed.drivername != "sqlite":
-        raise BackupRefused(f"abbe {what} copies SQLite files, and {mask_secrets(url)} is on a PostgreSQL server", SERVER_HELP)
+        raise BackupRefused(f"abbe {what} copies only SQLite files, and {mask_secrets(url)} is on a PostgreSQL server", SERVER_HELP)
     if parsed.database in {None, "", ":memory:"}:
-        raise BackupRefused(f"{url} is in memory only", "give the URL of a file, e.g. sqlite:///abbe.sqlite3")
+        raise BackupRefused(
+            f"abbe {what} needs a SQLite file, and {url} is in memory only", "give the URL of a file, e.g. sqlite:///abbe.sqlite3"
+        )
     return Path(str(parsed.database))
 
 

@@ -120,7 +120,7 @@ column of the other runs is wrong."""
 
 
 def column_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Flag ball-bar runs whose feed_mm_min or direction contradicts their positions and times; the search then uses these."""
+    """Flag ball-bar runs whose feed_mm_min or direction contradicts their positions and times; the search then uses positions and times."""
     out = []
     senses: dict[tuple[str, int], dict[str, float]] = {}
     for run in runs:
@@ -160,8 +160,8 @@ NOTHING_MM = 1e-9
 def copy_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
     """Return issues of runs whose readings occur in an earlier run, regardless of their labels.
 
-    If the readings show noise, equal readings are a copy whatever their times. Repeats with a coarse sensor can be equal without noise:
-    there a copy must also have the same times.
+    If the readings show noise, equal readings are a copy whatever their times. Without noise (coarse sensor) even repeats can be equal:
+    then only readings at the same times are a copy.
     """
     rows = [_rows(r) for r in runs]
     out = []
@@ -255,12 +255,12 @@ def refuse(issues: Sequence[CampaignIssue]) -> None:
 
 
 def artefact_issues(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Return issues of runs of artefacts that need no model: machine, positions."""
+    """Return the issues of runs of artefacts that are found without a model: machine, positions."""
     return [issue for run in runs for issue in _other_machine(machine, run) or geometry_issues(machine, run)]
 
 
 def check_files(machine: Doc, runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Return issues that need no model: machine, geometry, units, times, copies, too few readings.
+    """Return the issues that are found without a model: machine, geometry, units, times, copies, too few readings.
 
     ``machine``: the campaign's machine object; ``runs``: its runs with readings.
     """

@@ -27,7 +27,7 @@ from abbe.service.storage.store import Store
 class Campaign:
     """A campaign for a solver. ``folder``: its source, None for a campaign of the store; ``doc``: its campaign object.
 
-    ``removed``: the table whose side effects were subtracted from the readings; None without one. ``tables``: images of the compensation
+    ``removed``: the table whose side effects were subtracted from the readings, None if none was. ``tables``: images of the compensation
     tables that acted during the runs, by CRC, as far as the folder holds them; empty for a campaign of the store, which holds the images
     itself.
     """
@@ -72,9 +72,11 @@ class Campaign:
         errors = self.doc.get("current_model", {}).get("errors")
         acting = {run.table.acting_crc for run in self.runs if run.table.acting_crc is not None}
         if self.folder is None and (self.doc.get("format") != CAMPAIGN_FORMAT or errors is not None or not acting <= set(self.tables)):
-            raise Unusable(f"campaign {self.name} was read from a database", f"write it with its tables: abbe export {self.name} FOLDER")
+            what = f"campaign {self.name} was read from a database and cannot be written as a folder without its tables"
+            raise Unusable(what, f"write campaign and tables: abbe export {self.name} FOLDER")
         if self.removed is not None:
-            raise Unusable(f"a table was subtracted from the readings of campaign {self.name}", "save the campaign as it was read")
+            what = f"campaign {self.name} cannot be written as a folder: a table was subtracted from its readings"
+            raise Unusable(what, "write the campaign as it was read")
         known = None if errors is None or self.folder is None else read_json(self.folder / errors)
         return write_folder(self.doc, self.runs, self.tables, known, Path(folder))
 

@@ -151,7 +151,7 @@ def items(plan: CampaignPlan) -> tuple[Item, ...]:
 
 
 def in_mounting(item: Item, mounting: int) -> Item:
-    """Restart a test from its beginning, after an earlier test made the n-th mounting of its set-up."""
+    """Restart a test from its beginning in this mounting of its set-up, which an earlier test made."""
     whole = anew(item.test, mounting)
     return replace(item, whole=whole, left=whole, mounting=mounting)
 
@@ -172,7 +172,7 @@ def resumed_item(item: Item, hand: int | None, records: tuple[dict[str, Any], ..
 
 
 async def read_path(session: Session, store: Store, campaign: int, test: str, mounting: int) -> ReadProgress | None:
-    """Return how far the path of a test was read in a mounting; None if the ball-bar's box was restarted since."""
+    """Return how far the path of a test was read in a mounting; None if that is unknown or the ball-bar's box was restarted since."""
 
     def look() -> ReadProgress | None:
         lines = lines_of(store.checkpoints.of_campaign(campaign), RunLine)

@@ -57,7 +57,7 @@ class Needed:
 
 
 def needed_by(plan: CampaignPlan, *, air: bool = False) -> Needed:
-    """Return the devices that the steps of a campaign use; watching the ``air`` (``run_temperature_c``) needs the laser's sensor."""
+    """Return the devices that the steps of a campaign use. ``air``: its temperature is watched, which needs the laser's sensor."""
     first = {CNC: "all motion"}
     for role, kinds in USED_BY.items():
         test = next((t for t in plan.tests if any(isinstance(s, kinds) for s in t.steps)), None)

@@ -181,7 +181,10 @@ def _stream(heard: Heard) -> tuple[F1, F1]:
 
 
 def _controller_times(heard: Heard) -> tuple[Callable[[F1], F1], Lag | None]:
-    """Return the function from laser to controller time (both clocks fitted to the host clock), and the laser's lag or None."""
+    """Return the function that converts laser time to controller time, s, and the laser's lag; None if the positions do not show the lag.
+
+    Both clocks are fitted to the host clock.
+    """
     laser = _fit([(r.device_us, r.host_s) for r in heard.readings])
     cnc = _fit([(s.ctrl_us, s.host_s) for s in heard.statuses])
 
@@ -212,8 +215,7 @@ def _fit(pairs: list[tuple[int, float]]) -> ClockFit:
 def row_times(readings: Sequence[DwellReading | None], start_s: float, apart_s: float) -> list[float]:
     """Return the laser time of every planned reading, s, in rising order: the middle of its window.
 
-    Missing readings get interpolated times. Before the first found reading these begin at ``start_s``, after the last they are ``apart_s``
-    apart.
+    Missing readings get interpolated times: from ``start_s`` on before the first found reading, and every ``apart_s`` after the last one.
     """
     found = [(k, 0.5 * (one.start_s + one.end_s)) for k, one in enumerate(readings) if one is not None]
     at, times = [float(k) for k, _ in found], [t for _, t in found]

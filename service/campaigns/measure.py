@@ -158,7 +158,7 @@ async def start_campaign(session: Session, store: Store, site: Site, name: str, 
 
 
 def artefacts_of(plan: CampaignPlan) -> dict[str, Any]:
-    """Return the artefacts that a plan probes, as a field of the campaign's document; empty without one."""
+    """Return the artefacts that a plan probes, as a field of the campaign's document; an empty object if it probes none."""
     known = {name: doc for test in plan.tests for name, doc in test.artefact.items()}
     return {"artefacts": known} if known else {}
 
@@ -441,7 +441,7 @@ async def start_document(
 def _standstills(test: TestPlan, attempt: Attempt) -> dict[str, int]:
     """Return the number of standstill readings in a whole run: one per reading step, and those kept from before an interruption.
 
-    A kept reading that is read again counts once. A qualification sphere is no reading.
+    A kept reading that is read again counts once. The qualification sphere is not counted.
     """
     count = sum(isinstance(s, ReadLaser | ReadBar) or (isinstance(s, TouchFeature) and not s.qualifies) for s in test.steps)
     trail = attempt.resume_trail

@@ -225,7 +225,7 @@ def judge_note(plan: MeasuringPlan) -> str:
 
 
 def goal_lines(plan: MeasuringPlan) -> list[str]:
-    """Report on the goal, one sentence each; empty without a goal."""
+    """Say in sentences whether the plan reaches its goal; an empty list if it has no goal."""
     goal = plan.goal
     if goal is None:
         return []

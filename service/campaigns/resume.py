@@ -204,7 +204,7 @@ class _Finder:
         return resumed_item(item, hand, records, await read_path(session, self._store, self._campaign, label, number))
 
     def _records(self, label: str, number: int, *, earlier: bool) -> tuple[dict[str, Any], ...]:
-        """Return the records of the last run of a test in this mounting; ``earlier``: of the last run that has records."""
+        """Return the records of the last run of a test in this mounting, or, with ``earlier``, of its last run that has records."""
         runs = sorted((n for n, one in self._lines.runs.items() if (one.test, one.mounting) == (label, number)), reverse=True)
         for run in runs if earlier else runs[:1]:
             found = [record for chunk in self._store.chunks.of_run(run, LASER_CHANNEL) for record in decode_json(chunk.payload)]

@@ -335,7 +335,7 @@ def streams_doc(records: Iterable[Record]) -> list[list[int]]:
 
 
 def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
-    """Append parts in the form of `streams_doc`; merge adjacent parts of one stream."""
+    """Return the parts of both lists (as of `streams_doc`) in one list, adjacent parts of one stream merged."""
     spans = [list(span) for span in spans]
     for first, last, stream in more:
         if spans and spans[-1][1] + 1 == first and spans[-1][2] == stream:
@@ -346,7 +346,7 @@ def joined(spans: list[list[int]], more: list[list[int]]) -> list[list[int]]:
 
 
 def streams_from_end_doc(end_doc: dict[str, Any] | None) -> dict[int, int] | None:
-    """Return the stream of every chunk by its number; None if the run's end document states none (open run, or older version)."""
+    """Return the stream of every chunk by its number; None if the run's end document does not state it (open run, or older version)."""
     spans = ((end_doc or {}).get("capture") or {}).get("streams")
     if spans is None:
         return None

@@ -193,7 +193,7 @@ class CaptureLog:
             raise
 
     def _append_or_release(self, records: list[Record], items: list[Item]) -> DiskFull | None:
-        """Append, using the reserve if necessary; return the DiskFull error if it was used."""
+        """Append. If the disk is full, release the reserve, append again and return the DiskFull error; else return None."""
         try:
             self._append(records, items)
         except DiskFull as error:
@@ -343,7 +343,7 @@ class CaptureRecorder:
                 self.log.segment.path.parent.rmdir()
 
     def release(self) -> None:
-        """Let this process recover the segment like any other; until then `is_active` protects it."""
+        """Let this process recover the segment like any other segment; until this call `is_active` protects it."""
         _active.discard(_key(self.log.segment.path))
 
 

@@ -245,7 +245,7 @@ def _take_over(store: Store, path: Path, run: RunRecord | None, settings: Captur
 
 
 def _of_closed(store: Store, path: Path, run: RunRecord, scanned: Scan, settings: CaptureSettings) -> RecoveredRun | None:
-    """Handle the segment of a closed run, left by a process that ended too early, or by one that closed the run without the file."""
+    """Handle the segment of a closed run: its process ended before deleting it, or another process closed the run without its file."""
     if settings.keep:
         return None
     keys = store.chunks.crcs(run.id)

@@ -299,7 +299,7 @@ def digest(encoded: bytes | memoryview) -> bytes:
 
 
 def decode_at(data: bytes | memoryview, at: int) -> tuple[Record, int] | None:
-    """Return the record at an offset, and the offset of its end; None without a whole and undamaged record.
+    """Return the record at an offset, and the offset of its end; None if no whole, undamaged record begins there.
 
     Raises
     ------

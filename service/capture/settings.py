@@ -1,4 +1,4 @@
-"""Settings of the capture, and the folder of the segments: beside a SQLite file, else from the machine file."""
+"""Settings of the capture, and the folder of the segments: the configured one, else beside the SQLite file."""
 
 from __future__ import annotations
 

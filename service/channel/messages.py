@@ -134,7 +134,7 @@ class LiveSamples:
 
 @dataclass(frozen=True, slots=True)
 class LiveMachine:
-    """The machine during a measurement; None: nothing is measured any more."""
+    """State of the machine during a measurement; ``machine`` None: the measurement has ended."""
 
     __pydantic_config__ = _STRICT
     kind: Literal["machine"]

@@ -52,9 +52,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
 
 
 def _begun(_phase: str, _info: dict[str, int]) -> None:
-    """Set the collector's threshold of `abbe.service.children` at the first collection: by then imports are over and the command works."""
+    """Lower the threshold of the garbage collector at its first collection: by then imports are over and the command works."""
     gc.callbacks.remove(_begun)
-    gc.set_threshold(50_000)
+    gc.set_threshold(50_000)  # as in `abbe.service.children`
 
 
 def run(arguments: Sequence[str] | None = None) -> int:

@@ -72,7 +72,8 @@ def try_device(
         bool, typer.Option("--faults/--no-faults", help="Also simulate late, doubled, corrupted and missing replies.")
     ] = True,
     out: Annotated[
-        Path | None, typer.Option(metavar="FILE.json", help="Write the report to a file; tested=FILE.json in the device's URL names it.")
+        Path | None,
+        typer.Option(metavar="FILE.json", help="File for the report; add tested=FILE.json to the device's URL in the machine file."),
     ] = None,
     as_json: JsonOption = False,
 ) -> None:

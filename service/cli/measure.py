@@ -158,7 +158,7 @@ def _check(store: Store, config: MachineFile, campaign: str, recipe: str, begun_
 def _warn_before(loaded: LoadedMachine, site: Site, plan: CampaignPlan, *, dry: bool) -> None:
     """Warn of an expired certificate and of a timetable that cannot be kept; refuse a plan whose devices are not in the machine file.
 
-    With a controller, `abbe.service.campaigns.measure` refuses such a measurement instead, after rolling back an interrupted push.
+    If the machine file has a controller, `abbe.service.campaigns.measure` checks the devices, after rolling back an interrupted push.
     """
     from abbe.service.campaigns.device_checks import check_configured, needed_by
     from abbe.service.clock import SystemClock

@@ -216,7 +216,7 @@ async def check_commissioned(controller: Identity, store: Store, site: Site) -> 
     Raises
     ------
     TableRefused
-        Sign, axis and unit were never proved, or the last commissioning found that the control applies tables otherwise.
+        Sign, axis and unit were never proved, or the last commissioning found that the control does not act as the tables say.
     """
     found = await commissioned(controller, store, site)
     if found is False:

@@ -83,7 +83,7 @@ def identified(doc: dict[str, Any], *, without_scale: bool = False) -> Identifie
     if without_scale:
         scales = scales_badly_known(doc)
         if scales is None:
-            raise FormatRefused("this solution determines the scales as well as the rest", "omit --without-scale")
+            raise FormatRefused("no scale can be left out: this solution determines the scales as well as the rest", "omit --without-scale")
         coefficients = scale_projection(machine, terms, scales) @ coefficients
     return Identified(machine, terms, coefficients, observed)
 

@@ -164,7 +164,7 @@ def _figures(context: PushContext, solved: Solved, runs: list[Run]) -> Verificat
 
 
 def _misfit_mm(solved: Solved, before: list[Run], table: NineTables | None) -> float | None:
-    """Return the rms residual of the solution in a newer helix or pose; None without either."""
+    """Return the rms residual of the solution in a newer helix or pose, mm; None if neither was measured."""
     helix = next((r for r in before if r.test == "ballbar_helix"), None)
     if helix is not None:
         return helix_misfit(solved, _as_other_runs(helix, solved, table))

@@ -184,4 +184,5 @@ def check_waiting(store: Store, number: int, proposed: Proposed, now_s: float) -
     """
     now = proposal_status(store, number, proposed, now_s)
     if now.word not in ("proposed", "approved", "refused"):  # `approve` names the reasons against a refused one
-        raise TableRefused(f"proposal {number} is {now.word}: {now.text}", "propose again")
+        what = f"proposal {number} can no longer be approved or rejected: it is {now.word}: {now.text}"
+        raise TableRefused(what, "propose again")

@@ -44,7 +44,8 @@ def compare(store: Store, number: int, with_what: str) -> TableDifference:
     other = load(store, int(with_what))
     if other.candidate.machine != proposed.candidate.machine:
         raise TableRefused(
-            f"proposal {with_what} is for {other.candidate.machine!r}", f"compare proposals of {proposed.candidate.machine!r}"
+            f"proposal {number} cannot be compared with proposal {with_what}, which is for machine {other.candidate.machine!r}",
+            f"compare proposals of {proposed.candidate.machine!r}",
         )
     return TableDifference(f"proposal {number}", f"proposal {with_what}", changes(other.tables, proposed.tables))
 

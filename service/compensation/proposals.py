@@ -1,4 +1,4 @@
-"""From an identification campaign to a stored proposal: solve the runs, add the tables in force, collect the reasons against it.
+"""From an identification campaign to a stored proposal: solve the runs, add the tables in force, collect the reasons against the proposal.
 
 A machine that is measured with a table active shows the errors that this table leaves. Therefore the active table is read from the
 controller, and every run must have been measured with it. The new table is the active one plus the errors that the runs still show.
@@ -52,8 +52,8 @@ class Promise:
     """Computed tables and the model's prediction for them.
 
     ``tables``: absolute, rounded to the controller's unit; ``change``: what they add to the tables in force, before rounding. ``drift_mm``:
-    rms residual of the solution in the newest run that it did not use, None without one. ``ended_s``, ``last_s``: end of the oldest and of
-    the newest identifying run, seconds UTC.
+    rms residual of the solution in the newest run that it did not use, None if there is no such run. ``ended_s``, ``last_s``: end of the
+    oldest and of the newest identifying run, seconds UTC.
     """
 
     tables: NineTables

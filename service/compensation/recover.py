@@ -178,7 +178,7 @@ async def _accepted(controller: TableController, store: Store, site: Site, by: s
 
 
 def _open_with(crc: int, known: KnownTables) -> set[str]:
-    """Name the journal of the last push of this table if that push is open: recovery under another name would roll the table back."""
+    """Return the journal in which the last push of this table is open, if any: recovery under another name would roll the table back."""
     push = known.pushed.get(crc)
     return {push.chain} if push is not None and push.may_be_active else set()
 

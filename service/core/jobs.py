@@ -49,7 +49,7 @@ async def deny(_: str) -> bool:
 
 
 async def no_alarms(_: int) -> str:
-    """Refuse to search for the cause of an alarm: there are none."""
+    """Refuse to search for the cause of an alarm: this service raises no alarms."""
     return "this service raises no alarms"
 
 

@@ -85,7 +85,7 @@ class Given:
 
     @property
     def last(self) -> str:
-        """A number with as many decimals as the tolerance leaves, as a pattern for computed numbers."""
+        """The number 1 with as many decimals as computed numbers get at this tolerance."""
         return f"{1.0:.{self._decimals}f}"
 
     @property

@@ -21,7 +21,7 @@ PLACES = {"laboratory": "in the laboratory", "customer": "at the customer's", "l
 def certificate_of(document: Document, digest: str) -> dict[str, Any] | None:
     """Return number, facts, statements and missing facts of a certificate; None without a laboratory or without a measurement.
 
-    Values of facts are in the document's language, as far as they are ours: what people wrote stays as it is.
+    Values that Abbe writes are in the document's language; what people wrote stays as it is.
     ``digest``: SHA-256 of the report. The number is made from it, so equal results have the same number.
     """
     issuer = document.issuer

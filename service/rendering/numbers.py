@@ -14,7 +14,7 @@ COVERAGE = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Unit:
-    """Display unit of a length: its sign, and its size in internal units (µm for errors, mm for positions)."""
+    """Display unit of a length: its symbol, and its size in internal units (µm for errors, mm for positions)."""
 
     sign: str
     size: float = 1.0

@@ -23,7 +23,7 @@ MOST = 3
 
 
 def artefact_sections(joint: JointSolution) -> list[Section]:
-    """Return the section of a solution of artefacts alone; none for other solutions."""
+    """Return the section of a solution of artefacts alone; an empty list for other solutions."""
     if not joint.only_artefacts:
         return []
     slices = [one for box in touched_boxes_mm(joint) for one in _planes(joint, box)][:MOST]
@@ -81,8 +81,8 @@ ALONE = "the deviation of the machine: one pose shows machine and form of the ar
 def pose_readings(run: Run, data: RunData) -> Evaluated:
     """One pose as it was read, without the motion that fits it best: its features, their rms and their largest deviation.
 
-    ``data``: observations of ``run``. The uncertainty contains the touches alone. U of the largest deviation and of the arrows holds for
-    the largest of so many vectors (Sidak): noise alone exceeds it in at most 5 % of all poses.
+    ``data``: observations of ``run``. The uncertainty contains the touches alone. U of the arrows and of the largest deviation holds for
+    all arrows together (Sidak): noise alone exceeds it somewhere in at most 5 % of all poses.
     """
     p = data.points
     assert p is not None

@@ -85,7 +85,7 @@ def parameter_pictures(rows: Sequence[ParameterRow], ranked: Sequence[Contributi
 
 
 def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
-    """Parameters of cups, bars and mirrors as a folded section; empty without any."""
+    """Parameters of cups, bars and mirrors as a folded section; an empty list if there are none."""
     setup = [r for r in rows if r.note == SETUP_NOTE]
     if not setup:
         return []
@@ -96,7 +96,7 @@ def setup_section(rows: Sequence[ParameterRow]) -> list[Block]:
 
 
 def picture_section(pictures: Sequence[PictureBlock]) -> list[Section]:
-    """The pictures of a report as a section; empty without any."""
+    """The pictures of a report as a section; an empty list if there are none."""
     return [Section("Pictures", pictures)] if pictures else []
 
 

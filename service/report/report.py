@@ -96,7 +96,7 @@ def verification_report(store: Store, number: int, rules: Rules) -> Document:
     """
     record = next((v for v in store.verifications.latest(limit=MANY) if v.id == number), None)
     if record is None:
-        raise NotStored(f"no verification {number} in the database", "`abbe serve` and `abbe correct` store them; numbers begin with 1")
+        raise NotStored(f"no verification {number} in the database", "`abbe serve` and `abbe correct` store verifications, numbered from 1")
     machine = store.machines.get(record.machine_id)
     campaign = None if record.campaign_id is None else from_store(store, store.campaigns.find(record.campaign_id).name)
     runs = [] if campaign is None else campaign.runs
@@ -166,7 +166,8 @@ def push_report(store: Store, machine: str, number: int, rules: Rules) -> Docume
     journal = tuple(e for e in entries if e.push == number != NO_PUSH)
     if not journal:
         raise NotStored(
-            f"machine {machine!r} has no push {number}", f"it has {len({e.push for e in entries} - {NO_PUSH})}; their numbers begin with 1"
+            f"machine {machine!r} has no push {number}",
+            f"number of its pushes: {len({e.push for e in entries} - {NO_PUSH})}; the first is push 1",
         )
     known = facts(journal)
     machine = known.machine or machine  # name of the machine at the time of the push
@@ -306,7 +307,7 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
     having = [n for chain, n in chains.items() if any(e.push == number for e in store.pushes.entries_of(chain))]
     if len(having) != 1:
         if not having:
-            raise NotStored(f"no push {number} in the database", "`abbe correct` pushes tables; their numbers begin with 1")
+            raise NotStored(f"no push {number} in the database", "`abbe correct` pushes tables; the first push of a machine is push 1")
         raise StoreError(f"machines {', '.join(having)} each have a push {number}", "name the machine: --of NAME")
     return push_report(store, having[0], number, rules)
 

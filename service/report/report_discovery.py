@@ -209,7 +209,7 @@ def gap_table(finding: Finding) -> TextTable:
 
 
 def _what(finding: Finding) -> str:
-    """Name the effects added to the model between the gap before and the gap after; empty without any."""
+    """Say what was added to the model between the gap before and the gap after; empty if nothing was."""
     return {"none": "", "named": "what was found", "unknown": "a structure without a name"}[finding.verdict]
 
 

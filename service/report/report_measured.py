@@ -51,7 +51,7 @@ ANGLE_STATEMENT = (
 
 
 def evaluate_imported(campaign: Doc) -> Evaluated:
-    """Evaluate ``origins``, ``readings`` and ``stated`` of a campaign; empty for a campaign that Abbe measured."""
+    """Evaluate ``origins``, ``readings`` and ``stated`` of a campaign; the result is empty for a campaign that Abbe measured."""
     out = Evaluated()
     for doc in campaign.get("readings", ()):
         _readings(out, OtherReadings.read(doc))

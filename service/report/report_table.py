@@ -19,7 +19,7 @@ WORD = "Unverified table"
 
 @dataclass(frozen=True, slots=True)
 class TableRemarks:
-    """Remarks about the tables in force. ``unverified``: why the verdict by the limits is not valid; empty if it is."""
+    """Remarks about the tables in force. ``unverified``: why the verdict by the limits is not valid; empty if it is valid."""
 
     unverified: str = ""
     remarks: tuple[str, ...] = ()

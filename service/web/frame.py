@@ -78,7 +78,7 @@ class Frame:
 
     @property
     def who(self) -> str:
-        """Name of the person with this session; empty without one."""
+        """Name of the person with this session; empty if there is no session."""
         return self.visit.principal.name.partition(":")[2] if self.visit is not None and self.visit.secret else ""
 
     @property
@@ -104,7 +104,7 @@ class Frame:
         return units.shown(value, unit, self.units, decimals)
 
     def unit(self, unit: str = "µm") -> str:
-        """Sign of the reader's unit."""
+        """Symbol of the reader's unit."""
         return units.unit_in(unit, self.units)
 
     def with_u(self, value: float | None, u: float | None, unit: str = "µm") -> tuple[str, str]:

@@ -154,7 +154,7 @@ def trend_picture(key: str, points: Sequence[Point], zone: tzinfo, changes: Sequ
 
 
 def points_of(past: Sequence[Verification], key: str, changes: Sequence[datetime]) -> list[Point]:
-    """A figure of the checks that have it, in the reader's unit."""
+    """The points of a figure, one for each check that has the figure, in the reader's unit."""
     unit = language.figure(current().lang, key)[1]
     return [point for check in past if (point := _point(check, key, unit, changes)) is not None]
 

@@ -228,4 +228,4 @@ class RollbackBody(RequestBody):
 
 
 class PushBody(RequestBody):
-    """Empty: the approval determines the pushed tables."""
+    """An empty body: the approval determines the pushed tables."""

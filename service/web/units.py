@@ -35,13 +35,13 @@ _INCHES: Mapping[str, _InchUnit] = {
 
 
 def drawn_in(unit: str, system: str) -> Unit:
-    """The reader's unit with its sign and its size in ``unit``. Units other than lengths stay as they are."""
+    """The reader's unit with its symbol and its size in ``unit``. Units other than lengths stay as they are."""
     other = _INCHES.get(unit) if system == INCH else None
     return Unit(unit) if other is None else other.unit
 
 
 def unit_in(unit: str, system: str) -> str:
-    """Sign of the reader's unit."""
+    """Symbol of the reader's unit."""
     return drawn_in(unit, system).sign
 
 
@@ -57,7 +57,7 @@ def rounded(value: float | None, u: float | None, unit: str, system: str) -> tup
 
 
 def shown(value: float | str | None, unit: str, system: str, decimals: int | None = None) -> str:
-    """A number as text in the reader's unit, without the unit's sign.
+    """A number as text in the reader's unit, without the symbol of the unit.
 
     Parameters
     ----------

@@ -19,7 +19,11 @@ def backup(
     without_key: Annotated[bool, typer.Option("--without-key", help="Leave out the audit's key; keep it elsewhere.")] = False,
     share: Annotated[
         bool,
-        typer.Option("--share", help="Write only what the latest shared backup in the same folder lacks; every backup stays complete."),
+        typer.Option(
+            "--share",
+            help="Share unchanged pieces of the database, by links, with the latest --share backup in the same parent folder, and write "
+            "only the rest. Every backup is complete by itself.",
+        ),
     ] = False,
     db: DbOption = None,
     machine: MachineOption = None,

@@ -255,7 +255,7 @@ def _fresh(source: str, db: str | None, machine: Path | None, *, confirmed_none:
 
 
 def _machine_file(file: Path | None) -> MachineFile | None:
-    """Return the content of the named machine file; None without one."""
+    """Return the content of the named machine file; None if none is named."""
     from abbe.service.config import load_machine
 
     found = named_machine(file)
@@ -263,7 +263,7 @@ def _machine_file(file: Path | None) -> MachineFile | None:
 
 
 def _machine(file: Path | None) -> Any:
-    """Return the nominal geometry of a machine file; without one, a stand-in that only places the reference at zero."""
+    """Return the nominal geometry of the named machine file; if none is named, a stand-in that only places the reference at zero."""
     import numpy as np
 
     from abbe.models.machine import Machine

@@ -196,7 +196,7 @@ def _in_plane() -> list[Comparison]:
 
 
 def _on_grid(component: str, z_mm: float, figure: Callable[[GridSums], float]) -> Computed:
-    """Return the number that ``figure`` takes from a component's surface on the 9 x 9 grid; the allowance covers rounded coefficients."""
+    """Return ``figure`` of a component's sums over the 9 x 9 grid; the allowance covers the rounding of the coefficients."""
 
     def of(*beta: float) -> float:
         return figure(grid_sums(in_plane_coefficients(np.array(beta), z_mm)))

@@ -77,8 +77,9 @@ def read(case: VectorCase, checks: Checks) -> None:
     )
     for key, part in case.at("ranks").named(*RANK_PLANS):
         plan = RANK_PLANS[key](n * inc)
-        if len(part.parts()) != len(case.at("ranks", next(iter(RANK_PLANS))).parts()):
-            raise FileFormatError(f"{part.label}: expected as many degrees as the other experiments", LAYOUT)
+        wanted = len(case.at("ranks", next(iter(RANK_PLANS))).parts())
+        if len(part.parts()) != wanted:
+            raise FileFormatError(f"{part.label}: expected {wanted} polynomial degrees, got {len(part.parts())}", LAYOUT)
         found = [ranks(*problem(plan, degree + 1)) for degree in range(len(part.parts()))]
         checks.compare("rank and effective rank", found, part, unit="1")
     _demonstration(case, checks, n, inc)

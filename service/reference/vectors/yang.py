@@ -198,7 +198,7 @@ def read_ranks(case: VectorCase, checks: Checks) -> None:
     hidden = list(case.at("null_space_degree1").named(*case.at("ranks").keys()))
     for key, part in case.at("ranks").items():
         if len(part.parts()) != len(plans):
-            raise FileFormatError(f"{part.label}: expected {len(plans)} degrees as in N, got {len(part.parts())}", LAYOUT)
+            raise FileFormatError(f"{part.label}: expected {len(plans)} polynomial degrees as in N, got {len(part.parts())}", LAYOUT)
         found = [ranks(*experiment(part, key)(plan)) for plan in plans]
         checks.compare("rank and effective rank", found, part, unit="1")
     for key, part in hidden:
@@ -227,8 +227,8 @@ def _null_vector(case: VectorCase, checks: Checks, problem: Problem) -> None:
     """Compare the ratios of the named parameters up to a common sign, and check that their combination is unobservable."""
     names = [t.name for t in monomials(1)]
     stored = dict(case.items())
-    if not set(stored) <= set(names):
-        raise FileFormatError(f"{case.label}: parameters {', '.join(stored)} are not all known", f"known: {', '.join(names)}")
+    if unknown := [name for name in stored if name not in names]:
+        raise FileFormatError(f"{case.label}: unknown parameters {', '.join(unknown)}", f"known: {', '.join(names)}")
     parts = list(stored.values())
     weights, trace = hidden_combination(*problem, [names.index(k) for k in stored])
     # The sign of a null vector is arbitrary; take that of the file.
@@ -347,7 +347,7 @@ def _gains(case: VectorCase, checks: Checks, plan: YangPlan) -> None:
     nodes = workpiece_mm(_nodes(plan))
     for key, part in case.items():
         if len(part.parts()) != DEGREES:
-            raise FileFormatError(f"{part.label}: expected {DEGREES} degrees, got {len(part.parts())}", LAYOUT)
+            raise FileFormatError(f"{part.label}: expected {DEGREES} polynomial degrees, got {len(part.parts())}", LAYOUT)
         for k, value in enumerate(part.parts()):
             of_degree = replace(plan, degree=k + 1)
             gain = map_noise_gain(*experiment(part, key)(of_degree), of_degree.field()(nodes)).max()

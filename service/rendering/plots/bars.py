@@ -41,7 +41,7 @@ def contribution_bars(
 
 
 def _draw_size(svg: Svg, panel: Panel, known: tuple[float | None, float | None], y: float, height: float, style: str) -> None:
-    """Bar of a value's size with the whisker of its U; nothing without a value."""
+    """Bar of a value's size with the whisker of its U; nothing if the value is unknown."""
     value, u = known
     if finite(value):
         panel.draw_bar(svg, abs(value), y, height, style)

@@ -41,7 +41,7 @@ LOOK_BACK = 200
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """A figure in the reader's words and units, as value and U; ``change``: change since the last good check, None without one."""
+    """A figure in the reader's words and units, as value and U; ``change``: change since the last good check, if any."""
 
     name: str
     unit: str

@@ -105,7 +105,7 @@ class ShownField:
 
     @property
     def label(self) -> str:
-        """Key of its name in the catalogues, without the number of a schedule."""
+        """Key of the field's name in the catalogues, without the number of a schedule."""
         return re.sub(r"\[\d+\]", "", self.field.key)
 
     @property
@@ -160,7 +160,7 @@ def _times(cron: str | None) -> tuple[str, str, str]:
 
 
 def _cron(key: str, expression: str, form: Mapping[str, str]) -> str | None:
-    """The cron expression that a form requests. Raises FormError if it is not the only rule in the form."""
+    """The cron expression that a form requests. Raises FormError unless the form fills in the chosen kind of rule, and no other."""
     days, time = form.get(f"{key}.days"), form.get(f"{key}.time", "").strip()
     interval = form.get(f"{key.removesuffix('cron')}every_h", "").strip()
     if days is None:

@@ -75,7 +75,7 @@ def _add_forms(app: FastAPI, context: PageContext) -> None:
 
         def work(form: Form) -> None:
             if form.get("name", "") == own:
-                raise UserRefused("you change your own password in the settings", "give the present password there")
+                raise UserRefused("your own password can only be changed in the settings", "give the present password there")
             people.set_password(form.get("name", ""), _same(form))
 
         return await _changed(request, context, lambda _: "password", work)

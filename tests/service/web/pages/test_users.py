@@ -101,7 +101,7 @@ def test_a_name_added_twice_at_once_is_added_and_refused(alone: Served, monkeypa
 def test_an_admin_changes_the_own_password_in_the_settings_only(alone: Served) -> None:
     with as_user(alone, "adam") as client:
         answer = client.post("/users/password", data={"name": "adam", "new": NEW, "again": NEW})
-        assert (answer.status_code, answer.json()["detail"]) == (409, "you change your own password in the settings")
+        assert (answer.status_code, answer.json()["detail"]) == (409, "your own password can only be changed in the settings")
     token = alone.people.add_token("adam", "ci", ["users"], 1)
     with httpx.Client(base_url=alone.base, headers={"Authorization": f"Bearer {token}"}) as program:
         assert program.post("/users/password", data={"name": "adam", "new": NEW, "again": NEW}).status_code == 409
