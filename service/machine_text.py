@@ -77,9 +77,10 @@ def machine_text(
     doc : dict
         The machine as exchange files have it: name, chain, stroke_mm, tool_mm; optional vertical_axis and pivots_mm.
     urls : DeviceUrls
-        Addresses; a device without one gets a comment instead.
+        Addresses; a device without an address gets a comment instead.
     certificates : dict, optional
-        Last day of the certificate of ``ballbar``, ``laser`` and ``artefact``; an instrument without one gets a comment instead.
+        Last day of the certificate of ``ballbar``, ``laser`` and ``artefact``; an instrument without a certificate gets a comment
+        instead.
     limits : PushLimits, optional
         Limits of a table; only those that differ from the defaults are written.
     verify : bool

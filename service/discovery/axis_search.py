@@ -35,7 +35,7 @@ class _Scatter:
 def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
     """Search a test of one axis for a drift of its repeats, then the readings without that drift for effects of the catalogue.
 
-    The effects must exceed the scatter of the repeats, which is known without a noise model; if they do not,
+    The effects must exceed the scatter of the repeats, which is known without a noise model. If no effect does,
     return the result of `axis_drift`.
     """
     drift = axis_drift(case)

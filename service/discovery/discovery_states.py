@@ -182,7 +182,7 @@ def nothing_missing(finding: Finding) -> str:
 
 
 def _unjudged(finding: Finding) -> str:
-    """List the runs outside the fit that could not be judged, grouped by reason; empty without any."""
+    """List the runs outside the fit that could not be judged, grouped by reason; empty if all were judged."""
     by_reason: dict[str, list[str]] = {}
     for u in finding.unjudged:
         by_reason.setdefault(u.why, []).append(u.run)

@@ -108,7 +108,7 @@ def _left_out_text(finding: Finding) -> str:
 
 
 def _suspect_text(finding: Finding) -> str:
-    """List the effects that the holdout runs do not confirm; empty without any."""
+    """List the effects that the holdout runs do not confirm; empty if there is no such effect."""
     names = " and ".join(f"{e.full_title} {size_text(e)}" for e in finding.suspects)
     judging = finding.gaps.get("holdout")
     figures = "" if judging is None else f" ({_judging_text(judging)})"
@@ -182,7 +182,7 @@ def _plus_minus(value: float, u: float | None, what: str) -> str:
 
 
 def rival_lines(effect: EffectFound) -> list[str]:
-    """List the alternatives with their odds; without any, say why."""
+    """List the alternatives with their odds; if there are none, say why."""
     if not effect.alternatives:
         moves = effect.kind == "mean"
         return ["nothing else in the catalogue fits these runs as well" if moves else "no rival was tried: scatter has no shape to compare"]

@@ -37,7 +37,7 @@ def finding_of(
     Names that holdout runs refute, and that chance could give, are dropped if the present model explains all runs without them.
 
     ``known_mm``: contribution of the model book's effects, mm by run label, which was subtracted before the search and is added to the
-    predictions again. ``thinning``: the decimation of long runs; None without any.
+    predictions again. ``thinning``: the decimation of long runs; None if no run was decimated.
     """
     by_name = {e.name: e for e in effects}
     found = replace(found, predicted_mm={label: v + known_mm[label] for label, v in found.predicted_mm.items()})

@@ -228,7 +228,7 @@ class RunStart:
 
     @property
     def set_s(self) -> float:
-        """Time of mounting on the campaign's clock as the start document states it, s; 0 if it does not."""
+        """Time of mounting on the campaign's clock as the start document states it, s; 0 if it states none."""
         return float(self.setup.get("t_set_s", 0.0))
 
     @property

@@ -328,7 +328,7 @@ class RunPart:
 class RunTiming:
     """Agreement of the clocks of a ball-bar run (`abbe.service.runs.sample_columns`).
 
-    ``trouble``: their disagreement, empty without one; ``pieces``: pieces of a resumed path; ``document``: all figures as stored.
+    ``trouble``: their disagreement, empty if they agree; ``pieces``: pieces of a resumed path; ``document``: all figures as stored.
     """
 
     trouble: str = ""

@@ -134,7 +134,7 @@ class OutlierFound(FileObject):
 
 
 class ResidualTestResult(FileObject):
-    """One test of one run's residuals; ``text``: the finding, empty without one."""
+    """One test of one run's residuals; ``text``: the finding, empty if nothing was found."""
 
     run: str
     test: str

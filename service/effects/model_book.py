@@ -71,7 +71,7 @@ def _parsed(one: ModelRecord) -> ModelVersion:
 
 
 def current(store: Store, machine: str) -> ModelVersion | None:
-    """Return the newest version of a machine's model; None without any."""
+    """Return the newest version of a machine's model; None if the machine has no model."""
     found = store.models.all(machine)
     return _parsed(found[-1]) if found else None
 

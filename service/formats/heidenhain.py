@@ -130,7 +130,9 @@ def read(files: tuple[TextFile, ...], settings: FormatSettings) -> Compensation:
 
 
 def assigned(files: tuple[TextFile, ...]) -> list[tuple[str, TextFile]]:
-    """Return the axes and their .COM files by the active line of the .CMA; without it by the last letter of the names (X.COM, AXIS_X.COM).
+    """Return the axes and their .COM files: by the active line of the .CMA, or, if there is no .CMA, by the last letter of the names.
+
+    Such names are X.COM and AXIS_X.COM.
 
     Raises
     ------

@@ -145,7 +145,7 @@ class SignRule:
     """Sign rule: the number that a format writes for an error.
 
     ``per_error``: factor of the error, +1 or −1. ``adds_position``: the nominal position is added. ``sure``: whether a manual states the
-    sign explicitly; if not, verify the 10 µm step (docs/reference/formats.md) on the machine before loading a table.
+    sign explicitly; if none does, verify the 10 µm step (docs/reference/formats.md) on the machine before loading a table.
     """
 
     per_error: Literal[1, -1]

@@ -90,7 +90,7 @@ def remove_table(campaign: Campaign, table: NineTables | None) -> Campaign:
     """Return the campaign as if every axis had followed smooth corrections by ``table``, which was active during the measurement.
 
     ``removed`` of the result then names the table and the assumed lost motion with its uncertainty. Runs with another table than the
-    identify runs, or without one, stay unchanged. Without a ``table`` the campaign stays unchanged.
+    identify runs, or without a table, stay unchanged. Without a ``table`` the campaign stays unchanged.
 
     Raises
     ------

@@ -139,8 +139,8 @@ LISTED = 20
 class Assessment:
     """A solution with its observability, uncertainty and budget. ``prediction``: over the whole volume, best-fit rigid motion removed.
 
-    ``scale_free``: the same without the scales, for tables that do not correct scales; None unless scales are the largest part of the
-    uncertainty.
+    ``scale_free``: the assessment without the scales, for tables that do not correct scales; None unless scales are the largest part of
+    the uncertainty.
     ``left_out``: the scales that are left out of ``sources`` and of everything computed from them; ``joint`` still has these scales.
     """
 

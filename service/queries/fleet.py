@@ -57,7 +57,7 @@ class MachineStatus:
     verified : VerifiedBy
         Which measurement verified the table in force, or since when none has.
     next_due_utc, next_recipe : str
-        The service's next slot; empty if it does not run or has no timetable.
+        The service's next slot; empty if the service does not run or has no timetable.
     """
 
     machine: str
