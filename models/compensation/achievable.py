@@ -143,7 +143,7 @@ def motion_tables(
 
 
 def _writable(solution: JointSolution, known: set[str], motions: frozenset[str] | set[str] | None, any_tool: bool) -> frozenset[str]:
-    """Return the motions to write; refuse those that may not be written."""
+    """Return the motions to write; ValueError if one of the named motions may not be written."""
     observable_names = individually_observable(solution) if motions is None or any_tool else frozenset(known)
     wanted = observable_names if motions is None else frozenset(motions)
     if not wanted or not wanted <= known:

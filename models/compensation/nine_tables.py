@@ -43,7 +43,7 @@ def nine_tables(
 
 
 def entry_u(sources: ErrorSources, per_unit: F3) -> F2:
-    """Return the standard uncertainty of table entries, shape (n, 3), from their values ``per_unit`` of each coefficient."""
+    """Return the standard uncertainty of table entries, shape (n, 3); ``per_unit``: entries per unit of each coefficient."""
     return np.asarray(np.sqrt(variances(sources, per_unit.reshape(-1, per_unit.shape[2]))).reshape(per_unit.shape[:2]))
 
 

@@ -210,7 +210,7 @@ def bank_of(problem: WhitenedProblem, picks: Sequence[Pick]) -> Bank:
 
 
 def _groups(problem: WhitenedProblem, picks: Sequence[Pick]) -> Iterator[tuple[str, _Group]]:
-    """Identifier (`Pick.start`) and group of each pick that changes a reading."""
+    """Yield the identifier (`Pick.start`) and the group of each pick that changes a reading."""
     blocks = [(p, raw) for p, raw in ((p, p.raw(problem)) for p in picks) if raw.any()]
     if not blocks:
         return

@@ -250,11 +250,11 @@ class ChangeContext:
         return float(np.log(len(self.candidates)))
 
     def _changed(self, taken: Sequence[TakenChange]) -> F2:
-        """Factor of the covariance of these changes alone, shape (p, k)."""
+        """Factor of the covariance that the changes ``taken`` add, shape (p, k)."""
         return np.column_stack([self._open[:, :0], *(t.asked.directions * t.size for t in taken)])
 
     def _beside(self, taken: Sequence[TakenChange]) -> F2:
-        """Factor of the covariance of all unknowns with these changes, shape (p, k)."""
+        """Factor of the covariance of all unknowns, the changes ``taken`` included, shape (p, k)."""
         return np.column_stack([self._open, self._changed(taken)])
 
     def _free(self, chosen: Chosen, but: str) -> F2:

@@ -191,7 +191,7 @@ class Contest:
         return self._width(f"{pick.label}/{pick.forms[i].name}", pick.forms[i].signal, pick)
 
     def _width(self, name: str, signal: Signal, pick: Pick) -> float:
-        """Return ``logs`` of `price` for the signal of a pick or of one of its forms."""
+        """Return the argument ``logs`` of `price` for the signal of a pick or of one of its forms."""
         if name not in self.widths:
             columns = np.abs(self.problem.raw(signal, pick.key, pick.values))
             self.widths[name] = float(np.log(np.maximum((columns > 1e-5 * columns.max()).sum(axis=0), 2)).sum())

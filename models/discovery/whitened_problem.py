@@ -125,7 +125,7 @@ class SignalProjection:
 
 
 def rows_of(left: F2, columns: F2, prior_sd: F1) -> F2:
-    """Return what `SignalProjection.rows` returns for ``columns``; ``left``: what remains of them after the projection."""
+    """Do the same as `SignalProjection.rows` if the projection of ``columns`` is known already (``left``)."""
     gram = columns.T @ left + np.diag(prior_sd**-2.0)
     return np.asarray(scipy.linalg.solve_triangular(scipy.linalg.cholesky(0.5 * (gram + gram.T), lower=True), left.T, lower=True))
 

@@ -150,7 +150,7 @@ def _edges(axes_mm: F2) -> Lines | None:
 
 
 def _comparison(axes_mm: F2, lines: Lines) -> tuple[int, Callable[[int], bool]]:
-    """Return a number of parts, and the function that compares one part of the points with the grid of the lines."""
+    """Return the number of parts of the points, and the function that compares one part with the grid of the lines."""
     nx, ny, nz = (line.size for line in lines)
     grid, planes = np.asarray(axes_mm).reshape(nx, ny * nz, 3), max(1, COMPARED // (ny * nz))
     first = np.empty((ny, nz, 3))
@@ -179,7 +179,7 @@ def line_motions(motions: Motions, lines: Lines) -> tuple[F2, F2, F2]:
 
 
 def _product(machine: Machine, lines: Lines, motions: tuple[F2, F2, F2]) -> tuple[int, Callable[[int], bool], F4]:
-    """Return a number of parts, the function that computes one of them (True), and the deviation that they fill, shape (nx, ny, nz, 3), mm.
+    """Return the number of parts, the function that computes one part (True), and the array that the parts fill, (nx, ny, nz, 3), mm.
 
     ``motions``: EX EY EZ (mm, squareness included) and EA EB EC (rad) of each carriage along its line, shape (n_axis, 6). The lines need
     be neither even nor sorted.

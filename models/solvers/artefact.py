@@ -58,7 +58,7 @@ class Fine:
 
     @property
     def name(self) -> str:
-        """``nugget_X_259.06_y`` or ``wave_X_10_x_0``."""
+        """Name of the unknown, e.g. ``nugget_X_259.06_y`` or ``wave_X_10_x_0``."""
         where = f"{self.period_mm:.5g}" if self.period_mm else f"{self.at_mm:.2f}"
         end = f"_{self.phase}" if self.period_mm else ""
         return f"{'wave' if self.period_mm else 'nugget'}_{'XYZ'[self.axis]}_{where}_{LETTERS[self.component]}{end}"

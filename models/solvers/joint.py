@@ -262,7 +262,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
 
 
 def settled_points(machine: Machine, runs: tuple[RunData, ...], priors: Priors) -> tuple[CampaignProblem, CampaignFit]:
-    """Settle a campaign of artefacts with smooth motions only, for the search for faults."""
+    """Set up and solve a campaign of artefacts with smooth motions only, for the search for faults."""
     return _again(machine, smooth_terms(SMOOTH_ORDER), runs, replace(priors, pooled=True), expected_noise(runs, None, None), _silent)
 
 

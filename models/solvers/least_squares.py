@@ -40,7 +40,7 @@ def svd(a: F2, *, full_matrices: bool = False) -> tuple[F2, F1, F2]:
 
 
 def singular_values(a: F2) -> F1:
-    """Singular values only, largest first; raises as `svd`."""
+    """Singular values only, largest first; errors as in `svd`."""
     try:
         return np.asarray(scipy.linalg.svd(a, compute_uv=False, check_finite=False))
     except scipy.linalg.LinAlgError:

@@ -321,7 +321,7 @@ def _least_misfit_mm(s: SuspectRun) -> float:
 
 
 def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
-    """Return a run with the mistake that explains the campaign best."""
+    """Return the mistake in a run that explains the campaign best."""
     others = together(rest)
     misfit, expected = _misfit(others, run)
     noisy = _noisier(run.as_is, max(1.0, misfit / expected))
@@ -333,7 +333,7 @@ def _judged(run: _Run, rest: list[Part], as_is: float) -> SuspectRun:
 
 
 def _noisier(part: Part, factor: float) -> Part:
-    """Return the run with this many times the usual noise: division by 25.4 makes any noisy run quiet and does not prove a wrong unit."""
+    """Return the run with ``factor`` times its noise: that division by 25.4 makes a noisy run quiet does not prove a wrong unit."""
     return Part(part.a / factor, part.y / factor, part.log_sigma + part.y.size * float(np.log(factor)))
 
 

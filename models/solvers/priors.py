@@ -263,7 +263,7 @@ class _Number(NamedTuple):
 
 
 def _classes(kinds: list[str]) -> list[_Number]:
-    """Size of every class. A set-up may be better than usual by any factor, because its unknowns are not shapes that could diverge."""
+    """Size of every class, with its bounds; the sizes of set-up errors and of lost motion have no lower bound."""
     high = 2.0 * np.log(LARGEST_SIZE)
     low = {k: -np.inf if k in (*LEARNED_SETUP, "backlash") else 2.0 * np.log(SMALLEST_SIZE) for k in kinds}
     bounds = {k: (2.0 * np.log(SIZE_FACTOR), low[k], high) for k in kinds}

@@ -49,7 +49,7 @@ def _unlike(path: Path, key: str, values: Values) -> F2:
 
 
 def _rounded(path: Path, key: str, values: Values) -> F2:
-    """Return exp(-d / d0) times d / d0 and times its square, for a slower rise and a longer or shorter tail."""
+    """Return the spike times d / d0, and times (d / d0)^2, for a slower rise and a longer or shorter tail."""
     x = np.minimum(_since(path, key) / values["d0_mm"], 60.0)
     height = _height(path, key, values) * np.exp(-x)
     return _read(path, key, height * x, height * x**2)

@@ -15,7 +15,7 @@ def _hours(path: Path) -> F2:
 
 
 def zero_drift(path: Path, key: str, values: Values) -> F2:
-    """Return -0.93e-6 times the dead path times the hours since the first record, 1 K/h: while the air warms up, the laser reads short."""
+    """Return the error for air that warms by 1 K/h: -0.93e-6 per K times the dead path times the rise since the first record."""
     return np.asarray(AIR_PER_K * path.dead_path_mm * _hours(path))
 
 

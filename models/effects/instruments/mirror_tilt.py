@@ -11,7 +11,7 @@ from abbe.models.effects.path import Path
 
 
 def across(beam: F1) -> F2:
-    """Return two unit vectors across the beam n, shape (2, 3): e1 along n x (unit vector of its smallest component), and e2 = n x e1."""
+    """Return two unit vectors across the beam n, shape (2, 3): e1 along n × a, a the axis of the smallest component of n; e2 = n × e1."""
     one = np.cross(beam, np.eye(3)[int(np.argmin(np.abs(beam)))])
     one /= np.linalg.norm(one)
     return np.stack([one, np.cross(beam, one)])

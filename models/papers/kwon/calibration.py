@@ -325,7 +325,7 @@ class KwonCalibration:
         return np.asarray(np.sqrt(np.einsum("ncp,pq,ncq->nc", design, self.estimate.covariance, design)))
 
     def corrected_lambda_mm(self, p_mm: F2) -> F2:
-        """Return the commands that bring the real machine to positions in base coordinates, shape (n, 3); raises as `inverse`."""
+        """Return the commands that bring the real machine to positions in base coordinates, shape (n, 3); errors as in `inverse`."""
         return inverse(self.geometry, p_mm)
 
 

@@ -161,7 +161,7 @@ class SphereFit:
 
     @property
     def correlation(self) -> F2:
-        """Correlations of centre x, y, z and radius, shape (4, 4); on a hemisphere centre z and radius have -0.84."""
+        """Correlations of centre x, y, z and radius, shape (4, 4); on a hemisphere that of centre z and radius is -0.84."""
         return np.asarray(self.cofactor / np.outer(self.sigma, self.sigma))
 
     def noise_mm(self) -> float:

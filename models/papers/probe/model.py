@@ -175,7 +175,7 @@ class LobingMap:
         return np.asarray((1.0 - u) * inner + u * outer)
 
     def at(self, probe_direction: F2) -> F1:
-        """Return the probe error for OUTWARD directions (part to ball centre) in the probe frame, shape (..., 3); raises as `at_angles`."""
+        """Return the probe error for OUTWARD directions (part to ball centre) in the probe frame, (..., 3); errors as in `at_angles`."""
         return self.at_angles(*direction_angles(probe_direction))
 
     def _closed(self) -> tuple[F1, F2]:

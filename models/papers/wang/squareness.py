@@ -92,7 +92,7 @@ def bias_eq13(scale: F1, length_mm: F1) -> AcuteSquareness:
 
 
 def sum_test_mm(totals_mm: dict[str, float]) -> float:
-    """Return ppp + npp + pnp + ppn, mm: 0 by (12), 4 sum(X_i² e_i) / R with scale errors. Use (13) only if it is 0."""
+    """Return ppp + npp + pnp + ppn, mm: 0 by (12), 4 sum(X_i² e_i) / R with scale errors. Use (13) only if this sum is 0."""
     return float(sum(totals_mm[name] for name in ORDER))
 
 
