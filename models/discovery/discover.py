@@ -33,7 +33,7 @@ ROUNDS = 3
 
 
 def scattered(problem: WhitenedProblem, picks: Sequence[Pick], known: Sequence[VarianceFinding]) -> tuple[VarianceFinding, ...]:
-    """Find variance effects in the residuals of simulation and ``picks``, beside ``known`` ones; laser outliers are included here."""
+    """Find variance effects beside the ``known`` ones in the residuals of simulation and ``picks``, which include laser outliers."""
     solved = solve(problem, picks)
     white = whole_rest(problem, solved)
     sigma = tuple(problem.colours[k].sd_mm for k in problem.kinds)
