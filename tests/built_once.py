@@ -40,14 +40,18 @@ def once_per_run(factory: pytest.TempPathFactory, name: str, make: Callable[[Pat
 
 @pytest.fixture(scope="session", autouse=True)
 def _commands_built_once() -> Iterator[None]:
-    """Typer builds the tree of all commands anew at each call of one; it is a function of what is registered."""
+    """Typer builds the tree of commands anew at each call of one; it is a function of what is registered.
+
+    `abbe.service.cli.named_by` makes an application of its own for each call, with what the whole one has registered.
+    """
     build = typer.main.get_command
-    built: dict[tuple[int, int], tuple[typer.Typer, Any]] = {}
+    built: dict[tuple[int, ...], tuple[list[Any], Any]] = {}
 
     def get_command(app: typer.Typer) -> Any:
-        key = (id(app), len(app.registered_commands) + len(app.registered_groups))
+        parts = [app.info, app.registered_callback, *app.registered_commands, *app.registered_groups]
+        key = tuple(map(id, parts))
         if key not in built:
-            built[key] = (app, build(app))  # the application is held with it: its id stays its own
+            built[key] = (parts, build(app))  # the parts are held with it: their ids stay their own
         return built[key][1]
 
     with pytest.MonkeyPatch.context() as patch:

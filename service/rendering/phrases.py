@@ -91,11 +91,17 @@ def is_whole(lang: str, text: str) -> bool:
     return bool(parts) and all(is_whole(lang, part) for part in parts)
 
 
+@lru_cache(4096)
+def _likely(lang: str, first: str, last: str) -> tuple[_Pattern, ...]:
+    """Patterns that a text with these first two letters and this last one may fit, in their order."""
+    return tuple(one for one in _phrases(lang)[1] if first.startswith(one.head[:2]) and last.endswith(one.tail[-1:]))
+
+
 def _fitting(lang: str, text: str) -> str | None:
-    exact, patterns = _phrases(lang)
+    exact = _phrases(lang)[0]
     if text in exact:
         return exact[text]
-    for one in patterns:
+    for one in _likely(lang, text[:2], text[-1:]):
         if text.startswith(one.head) and text.endswith(one.tail):
             found = one.fits.fullmatch(text)
             if found is not None:
