@@ -178,7 +178,7 @@ class WhitenedProblem:
         return self.white_all(columns * self.use[:, None])
 
     def white_all(self, columns: F2) -> F2:
-        """Whiten columns (n, k), mm, to unit noise, also in readings that are left out."""
+        """Whiten columns (n, k), mm, to unit noise without the weights ``use``: readings left out of the fit keep their values."""
         out = unscaled(columns, self.lengths, self.kinds, self.colours)
         out /= self.sd_mm()[:, None]
         return out

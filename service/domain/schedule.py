@@ -70,7 +70,7 @@ class Needs:
     operator: Annotated[
         Literal["any", "present", "absent"],
         Loosens("dropped"),
-        Field(description="whether an operator is there, by [[staffed]]; absent also requires a shut door"),
+        Field(description="present: only in the hours of [[staffed]]; absent: only outside them, with the door shut and the mode remote"),
     ] = "any"
 
 

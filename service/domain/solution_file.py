@@ -324,7 +324,10 @@ class SolutionFile(FileObject):
     )
     motions: dict[str, MotionValue]
     rank: Rank
-    rough: list[str] = Field(default_factory=list, description="which motions are rough, with length or period and remedy")
+    rough: list[str] = Field(
+        default_factory=list,
+        description="error motions with short parts that the smooth model does not follow: size, length or period, spacing of a table",
+    )
     artefacts: list[str] = Field(
         default_factory=list,
         description="errors that the poses of an artefact hide, the pose that would show them; separate fit of each workpiece",

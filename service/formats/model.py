@@ -52,7 +52,7 @@ class AxisTable:
 
     @property
     def own(self) -> bool:
-        """Whether the axis corrects itself (positioning)."""
+        """Whether the axis that moves is the one that is corrected: a table of positioning errors."""
         return self.axis == self.output
 
     @property

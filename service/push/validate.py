@@ -1,4 +1,4 @@
-"""A proposed table, the limits of a table, and the reasons against it that need no controller: form, numbers, promise, evidence, policy.
+"""A proposed table, its limits, and the checks that reject it without the controller: form, numbers, predicted gain, evidence, policy.
 
 All reasons are collected, so that a person sees everything at once. Only an empty list admits a table. A table beyond a limit is rejected;
 its values are never cut to the limit. Pure.

@@ -128,7 +128,10 @@ def _rows(path: Path) -> Iterator[tuple[int, list[str]]]:
 
 def _check_header(path: Path, header: Sequence[str]) -> None:
     if len(header) == 1 and any(mark in header[0] for mark in ";\t"):
-        raise FileFormatError(f"{path}: line 1: columns are not separated by commas", "write x_mm,y_mm,z_mm and decimal points")
+        raise FileFormatError(
+            f"{path}: line 1: columns are not separated by commas",
+            "separate columns by commas (x_mm,y_mm,z_mm), and write decimals with a point",
+        )
     twice = next((name for name in header if header.count(name) > 1), None)
     if twice is not None:
         raise FileFormatError(f"{path}: column {twice!r} appears twice", "leave one out")

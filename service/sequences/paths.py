@@ -95,7 +95,7 @@ def with_warning(error: BaseException) -> BaseException:
 
 
 def warnings_of(error: BaseException) -> list[str]:
-    """Return the notes of an error."""
+    """Return the notes of an exception (PEP 678)."""
     return list(getattr(error, "__notes__", []))
 
 

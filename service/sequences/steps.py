@@ -51,7 +51,7 @@ class MountLaser:
 
 @dataclass(frozen=True, slots=True)
 class Unmount:
-    """A person clears the table before anything moves fast again. Skipped when the test fails: a person is there anyway."""
+    """A person takes the instrument off the machine before anything moves fast again. A test that fails skips this step."""
 
 
 @dataclass(frozen=True, slots=True)

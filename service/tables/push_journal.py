@@ -246,7 +246,7 @@ class JournalView:
         if self.origin(kept[-1]).kind == KIND:
             raise TableRefused(
                 f"the last kept push ({kept[-1][-1].push}) was itself a rollback",
-                f"name the push with abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
+                f"choose the push whose table is wanted again: abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
             )
         return kept[-1]
 
@@ -269,7 +269,7 @@ class JournalView:
         if known.crc != crc:
             raise TableRefused(
                 f"the table in force ({crc:08X}) is not the one of push {last[-1].push}, the last that was kept",
-                f"name the push with abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
+                f"choose the push whose table is wanted again: abbe comp rollback -m MACHINE.toml --to PUSH; {NOTHING}",
             )
         return RollbackOffer(last[-1].push, crc, known.base_crc)
 

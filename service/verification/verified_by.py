@@ -218,7 +218,7 @@ def began(store: Store, record: VerificationRecord) -> datetime:
 
 
 def started(record: VerificationRecord) -> datetime:
-    """Start of a check, when its table was read."""
+    """Return when a check started, which is when it read the table in force; if that was not recorded, the time of its record."""
     return datetime.fromisoformat(record.doc.get("started_utc") or record.utc)
 
 

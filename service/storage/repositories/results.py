@@ -228,10 +228,10 @@ class Models(Repository):
 
 
 def _add_version(connection: Connection, model: NewVersion, discovery_id: int | None, now: str) -> int:
-    """Compare and swap: append the version only if its base is the current one.
+    """Append the version only if its base is the current one (compare and swap).
 
-    SQLite has one writer at a time, so the SELECT decides. On PostgreSQL two processes may read at once; the second one to insert the
-    number waits for the first and violates the constraint.
+    On SQLite the SELECT is enough, because only one writer works at a time. On PostgreSQL two processes may read the same current version;
+    the second INSERT then waits for the first and fails, as machine and version must be unique.
     """
     table = machine_models.c
     last = connection.execute(select(func.max(table.version)).where(table.machine == model.machine)).scalar()
