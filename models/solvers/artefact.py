@@ -384,7 +384,8 @@ def _expansion(p: ArtefactPoints, known: Known) -> tuple[float, F1]:
 def _place_slopes(p: ArtefactPoints, known: Known, feature: tuple[str, ...], nominal_mm: F2, back: F2, moved: F2) -> dict[str, F1]:
     """Derivatives of readings, by name of the unknown: the artefact's form, scale, expansion and temperature, and the scale of the CMM.
 
-    ``back``: derivative of each reading with respect to the place of its feature; ``moved``: the machine's deviation there, in artefact axes, mm.
+    ``back``: derivative of each reading with respect to the place of its feature; ``moved``: the machine's deviation there, in artefact
+    axes, mm.
     """
     out: dict[str, F1] = {}
     for i, f in enumerate(feature):
