@@ -107,6 +107,19 @@ class Condition(Flag):
 
 
 NOTHING_HOLDS = Condition(0)
+WRONG_STATES = {
+    Condition.ESTOP: "the e-stop is pressed",
+    Condition.DOOR_OPEN: "the door is open",
+    Condition.ALARM: "there is an alarm",
+    Condition.REMOTE: "not in remote mode",
+    Condition.REFERENCED: "the axes are not referenced",
+    Condition.DRIVES_ON: "the drives are off",
+    Condition.MOVING: "an axis moves",
+    Condition.PATH_RUNNING: "a path is running",
+    Condition.NC_PROGRAM: "an NC program is running",
+    Condition.SPINDLE: "the spindle turns",
+}
+"""What is wrong, in words, about a condition that has the state which a job forbids."""
 
 
 @dataclass(frozen=True, slots=True)

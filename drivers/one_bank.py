@@ -16,7 +16,7 @@ from __future__ import annotations
 import zlib
 from typing import Any
 
-from abbe.drivers.api import BankState, CompStatus, Condition, OneBank
+from abbe.drivers.api import WRONG_STATES, BankState, CompStatus, Condition, OneBank
 from abbe.drivers.errors import DeviceFault, DriverError, Refused
 
 LEASE_MS = 60_000
@@ -172,5 +172,4 @@ class OneBankTables:
         conditions = (await self._c.status()).conditions
         wrong = (conditions & FORBIDDEN) | (NEEDED & ~conditions)
         if wrong:
-            states = [f"{flag.name} is {'on' if flag & conditions else 'off'}".lower() for flag in wrong]
-            raise Refused("one table", "exchange", f"not safe now: {', '.join(states)}")
+            raise Refused("one table", "exchange", f"not safe now: {'; '.join(WRONG_STATES[flag] for flag in wrong)}")

@@ -12,6 +12,7 @@ A driver is imported with its first device: a command waits only for the drivers
 from __future__ import annotations
 
 from collections.abc import Mapping
+from importlib import import_module
 from importlib.metadata import EntryPoint
 from typing import TYPE_CHECKING, cast
 
@@ -36,6 +37,32 @@ if TYPE_CHECKING:
 
 HEARTBEAT_S = 1.0
 """Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
+
+
+_MODULES = {"ballbar": "ballbar.driver", "laser": "laser.driver", "cnc": "cnc.driver", "fixture": "fixture.driver"}
+
+
+def load(role: str, url: str) -> None:
+    """Import the driver that opens a URL for a role, which takes up to a second: in a thread, as open links have to go on.
+
+    Raises
+    ------
+    BadUrl
+        Not a URL, or its driver cannot be imported.
+    """
+    if (entry := installed(url)) is not None:
+        names = [entry.value.partition(":")[0], "abbe.drivers.one_bank", "abbe.drivers.described.tested"]
+    elif role != "fixture" and described_by(parse_url(url)):
+        names = ["abbe.drivers.described.opening", "abbe.drivers.described.tested"]
+    else:
+        links = {"ballbar": ["abbe.drivers.links.serial_link"], "fixture": []}.get(role, ["abbe.drivers.links.modbus_link"])
+        names = [f"abbe.drivers.{_MODULES[role]}", *links]
+    for name in names:
+        try:
+            import_module(name)
+        except Exception as fault:  # an import of foreign code may raise anything
+            detail = f"the driver {name} cannot be loaded: {type(fault).__name__}: {fault}"
+            raise BadUrl(ascii(url), "open device", detail, "install Abbe and the package that offers the driver again") from fault
 
 
 async def open_ballbar(url: str) -> BallBar:
@@ -170,6 +197,8 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
         raise BadUrl(
             ascii(url), "open device", f"the driver {entry.value} opens no {role}", f"name a driver for {role} under [devices] {role}"
         )
+    from abbe.drivers.described.tested import Ability, check_tested
+
     bare, report = split_report(url)
     device = await driver[role](bare)
     needed = {name for name in dir(ROLES[role]) if name[0] != "_"}
@@ -181,8 +210,6 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
             await device.close()
         raise BadUrl(ascii(url), "open device", f"the driver {entry.value} lacks {', '.join(missing)}", remedy)
     if report:
-        from abbe.drivers.described.tested import Ability, check_tested
-
         info = await _identify_or_close(device)
         try:
             check_tested(bare, report, "", info.serial_no, Ability.DWELL)

@@ -40,7 +40,7 @@ def t_above(t: ArrayLike, dof: ArrayLike) -> F1:
 
 
 def t_limit(p: float, dof: float) -> float:
-    """Return the value above which Student's t lies with probability ``p`` (below 0.5); ``dof`` is positive and finite."""
+    """Return the value above which Student's t lies with probability ``p`` (between 0 and 0.5); ``dof`` is positive and finite."""
     t = float(normal_limit(p))  # below the limit sought, where the tail is convex: Newton's steps come from one side
     log_scale = -0.5 * math.log(dof * math.pi) - float(_log_ratio(np.array([0.5 * dof]))[0])
     for _ in range(ROUNDS):

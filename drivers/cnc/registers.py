@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntFlag
 
-from abbe.drivers.api import NOTHING_HOLDS, BankState, CompStatus, Condition, ControllerStatus, Latch, Point, ProbeState
+from abbe.drivers.api import NOTHING_HOLDS, WRONG_STATES, BankState, CompStatus, Condition, ControllerStatus, Latch, Point, ProbeState
 from abbe.drivers.links.words import Register, RegisterBlock, words_of
 
 MAP_VERSION = 1
@@ -131,17 +131,8 @@ class Bit(IntFlag):
 
 
 _CONDITIONS = {bit: Condition[bit.name] for bit in Bit if bit.name is not None}
-_MUST_BE_CLEAR = {
-    Condition.ESTOP: "the e-stop is pressed",
-    Condition.DOOR_OPEN: "the door is open",
-    Condition.ALARM: "there is an alarm",
-    Condition.NC_PROGRAM: "an NC program is running",
-}
-_MUST_BE_SET = {
-    Condition.REMOTE: "not in remote mode",
-    Condition.REFERENCED: "the axes are not referenced",
-    Condition.DRIVES_ON: "the drives are off",
-}
+_MUST_BE_CLEAR = Condition.ESTOP | Condition.DOOR_OPEN | Condition.ALARM | Condition.NC_PROGRAM
+_MUST_BE_SET = Condition.REMOTE | Condition.REFERENCED | Condition.DRIVES_ON
 
 
 def fingerprint(counts: Mapping[str, int]) -> str:
@@ -163,8 +154,7 @@ def conditions_of(bits: int) -> Condition:
 
 def interlocks(conditions: Condition) -> list[str]:
     """Describe the unmet conditions for motion; empty if the machine may move."""
-    wrong = [text for one, text in _MUST_BE_CLEAR.items() if one in conditions]
-    return wrong + [text for one, text in _MUST_BE_SET.items() if one not in conditions]
+    return [WRONG_STATES[one] for one in (*(_MUST_BE_CLEAR & conditions), *(_MUST_BE_SET & ~conditions))]
 
 
 @dataclass(frozen=True, slots=True)

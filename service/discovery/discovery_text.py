@@ -146,7 +146,7 @@ def lines_of(finding: Finding) -> list[str]:
     for e in finding.effects:
         out += effect_lines(e)
     if finding.confounded_with:
-        out.append("these runs cannot tell the named effects from: " + ", ".join(finding.confounded_with))
+        out.append("these runs cannot tell the finding from: " + ", ".join(finding.confounded_with))
     return out + changed_lines(finding.changed) + book_lines(finding) + next_of(finding)
 
 

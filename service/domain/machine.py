@@ -140,12 +140,15 @@ def control_of(url: str | None) -> str:
 def address_of(url: str | None) -> str:
     """Return the address in a URL for the machine lock: scheme, host in lower case and port (or the path of a serial line), no query.
 
-    All units behind one address share one lock.
+    All units behind one address share one lock. Text that is no URL is its own address: the machine file refuses it later.
     """
     if not url:
         return ""
     plain = url.partition("?")[0]
-    parts = urlsplit(plain)
+    try:
+        parts = urlsplit(plain)
+    except ValueError:
+        return plain
     return f"{parts.scheme}://{parts.netloc.lower()}{parts.path.rstrip('/')}" if parts.scheme else plain
 
 

@@ -42,7 +42,9 @@ def read_rtx(name: str, data: bytes) -> Content:
     values = np.frombuffer(samples, SAMPLE, count).astype(np.float64)
     bad = np.flatnonzero(~np.isfinite(values) | (np.abs(values) > LARGEST))
     if bad.size:
-        raise file.wrong(at, f"sample {bad[0] + 1} is {values[bad[0]]:g}, expected {-LARGEST:g} to {LARGEST:g}", "export the file again")
+        raise file.wrong(
+            at, f"sample {bad[0] + 1} is {float(values[bad[0]])!r}, expected {-LARGEST:g} to {LARGEST:g}", "export the file again"
+        )
     return Content(
         name=name,
         form="Renishaw .rtx",

@@ -77,8 +77,13 @@ def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigm
 
 
 def without_band(frequency_hz: float, axis: int, path: Path, rest: F1) -> F1:
-    """Project a wave along an axis with a slowly changing amplitude (`BAND`) out of the residuals of a run; exact zeros stay."""
+    """Project a wave along an axis with a slowly changing amplitude (`BAND`) out of the residuals of a run; exact zeros stay.
+
+    A run too short for that keeps its residuals.
+    """
     t = path.at.t_s - path.at.t_s[0]
+    if path.n < 2 * (2 * BAND + 1) or t[-1] <= 0.0:
+        return rest
     cycles = frequency_hz * t[:, None] + np.outer(t / t[-1], np.arange(-BAND, BAND + 1))
     waves = np.concatenate([np.cos(2.0 * np.pi * cycles), np.sin(2.0 * np.pi * cycles)], axis=1) * path.look[:, axis, None]
     base, size, _ = np.linalg.svd(waves * (rest != 0.0)[:, None], full_matrices=False)

@@ -51,7 +51,7 @@ def push(
 
     async def work(store: Store) -> Correction:
         async with ready_session(store, site, accept_table=accept_table) as session:
-            await loaded_beside("abbe.service.compensation.correct")
+            await loaded_beside("abbe.service.compensation.correct", "rich.console", "rich.progress")
             from abbe.service.compensation.correct import push as work_push
             from abbe.service.compensation.gate import PushContext, admit
 
@@ -211,9 +211,8 @@ def commission(
 
     async def work(store: Store) -> tuple[ProvedLevels, SignCommissioning | None]:
         async with ready_session(store, site, accept_table=accept_table) as session:
-            await loaded_beside(
-                *(f"abbe.service.compensation.{name}" for name in ("commission", "commission_levels", "commission_one_bank"))
-            )
+            names = ("commission", "commission_levels", "commission_one_bank")
+            await loaded_beside(*(f"abbe.service.compensation.{name}" for name in names), "rich.console", "rich.progress")
             from abbe.service.compensation.commission import commission as work_commission
             from abbe.service.compensation.commission_levels import commission_levels
             from abbe.service.compensation.commission_one_bank import commission_one_bank

@@ -7,7 +7,7 @@ import pytest
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.localization import Localization
-from abbe.models.discovery.variance.creeping_axis import at_standstill, creep_speed
+from abbe.models.discovery.variance.creeping_axis import at_standstill, creep_speed, without_band
 from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance
 from abbe.models.effects.path import Path
 from abbe.models.paths import helix_points
@@ -94,3 +94,8 @@ def test_height_at_standstill_gives_the_same_teeth_at_the_one_speed(speed_mm_s: 
     assert height * np.exp(-((speed_mm_s / v_c) ** 2)) == pytest.approx(2.0)
     assert u > 0.1
     assert v_c >= speed_mm_s
+
+
+def test_a_run_too_short_for_a_band_keeps_its_residuals() -> None:
+    short = bar("two", HELIX[:2], 620.0, feed=1200.0, back=False, test="ballbar_helix")
+    assert without_band(7.0, 2, short, np.ones(short.n)).tolist() == [1.0] * short.n

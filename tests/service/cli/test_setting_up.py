@@ -54,6 +54,7 @@ def test_answers_become_a_machine_file_that_abbe_reads(folder: Path, capsys) -> 
         (("--strokes", "600,500,450"), "three strokes FROM..TO in mm, separated by commas, are expected"),
         (("--strokes", "600..0,0..500,0..450"), "stroke_mm"),
         (("--laser", "COM3"), "laser"),
+        (("--cnc", "modbus+tcp://[::1"), "cnc"),
         (("--certificates", "soon,later"), "--certificates 'soon,later'"),
     ],
 )

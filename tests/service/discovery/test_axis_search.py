@@ -45,7 +45,7 @@ def test_a_drift_alone_says_what_closed_on_the_cycle_that_was_never_fitted() -> 
     held = finding.gaps["holdout"]
     assert f"also on runs that were never fitted, from {held.before_um:.3g} to" in text
     assert text.count("closed)") == 1  # fitted runs flatter
-    assert f" µm, {held.closed:.0%} closed)" in text
+    assert f"(noise alone: {held.floor_um:.3f} µm, {held.closed:.0%} closed)" in text
 
 
 def test_a_repeatable_shape_beyond_the_present_model_is_not_called_complete() -> None:
