@@ -186,6 +186,11 @@ def between(table: list[tuple[float, float]], at: float) -> float:
     return low[1] + (high[1] - low[1]) * (at - low[0]) / (high[0] - low[0])
 
 
+def grid_image(solution: JointSolution) -> bytes:
+    """The image of a bank with the grid that corrects a solution."""
+    return image_of(quantise_grid(grid_table(solution, COUNTS), LSB_MM))
+
+
 async def volumetric(machine: Instance) -> dict[str, float]:
     """Identify with bar and laser, push a grid, stand at random points."""
     truth = Truth(2)
@@ -199,8 +204,10 @@ async def volumetric(machine: Instance) -> dict[str, float]:
         solution = await asyncio.to_thread(solve_joint, MACHINE, runs, order=9, sigma_mm=SIGMA, floor_mm=FLOOR)
         solved = time.monotonic()
         before = field_statistics(points, truth.deviation(points)).rms_mm
+        # In a thread, like the solution: the loop serves the other control too, whose replies have a second.
+        image, bound_mm = await asyncio.to_thread(lambda: (grid_image(solution), best_rms(truth, solution, points)))
         assert np.abs(await behind.deviation(points[:5]) - truth.deviation(points[:5])).max() < 1e-9  # nothing is corrected yet
-        await push(cnc, image_of(quantise_grid(grid_table(solution, COUNTS), LSB_MM)))
+        await push(cnc, image)
         pushed = time.monotonic()
         after = field_statistics(points, await behind.deviation(points)).rms_mm
     return {
@@ -210,7 +217,7 @@ async def volumetric(machine: Instance) -> dict[str, float]:
         "verified_s": time.monotonic() - pushed,
         "before_um": before * 1e3,
         "after_um": after * 1e3,
-        "bound_um": best_rms(truth, solution, points) * 1e3,
+        "bound_um": bound_mm * 1e3,
     }
 
 
