@@ -44,7 +44,7 @@ def test_hemispheres_nowhere_are_refused():
         ({"turns": np.nan}, "turns"),
         ({"axis": 5}, "axis 5"),
         ({"axis": -1}, "axis -1"),
-        ({"n": 1}, "n must"),
+        ({"n": 1}, "n = 1 must"),
         ({"span_rad": 2.0}, "span"),
         ({"centre_mm": np.zeros(2)}, "centre"),
     ],
