@@ -45,24 +45,31 @@ _MODULES = {"ballbar": "ballbar.driver", "laser": "laser.driver", "cnc": "cnc.dr
 def load(role: str, url: str) -> None:
     """Import the driver that opens a URL for a role, which takes up to a second: in a thread, as open links have to go on.
 
+    What is wrong with the URL, or with a driver of an installed package, is told by the opening of the device.
+
     Raises
     ------
     BadUrl
-        Not a URL, or its driver cannot be imported.
+        A driver of this program cannot be imported.
     """
-    if (entry := installed(url)) is not None:
-        names = [entry.value.partition(":")[0], "abbe.drivers.one_bank", "abbe.drivers.described.tested"]
-    elif role != "fixture" and described_by(parse_url(url)):
-        names = ["abbe.drivers.described.opening", "abbe.drivers.described.tested"]
-    else:
-        links = {"ballbar": ["abbe.drivers.links.serial_link"], "fixture": []}.get(role, ["abbe.drivers.links.modbus_link"])
-        names = [f"abbe.drivers.{_MODULES[role]}", *links]
+    try:
+        if (entry := installed(url)) is not None:
+            names = [entry.value.partition(":")[0], "abbe.drivers.one_bank", "abbe.drivers.described.tested"]
+        elif role != "fixture" and described_by(parse_url(url)):
+            names = ["abbe.drivers.described.opening", "abbe.drivers.described.tested"]
+        else:
+            parse_url(url)
+            links = {"ballbar": ["abbe.drivers.links.serial_link"], "fixture": []}.get(role, ["abbe.drivers.links.modbus_link"])
+            names = [f"abbe.drivers.{_MODULES[role]}", *links]
+    except BadUrl:
+        return
     for name in names:
         try:
             import_module(name)
         except Exception as fault:  # an import of foreign code may raise anything
-            detail = f"the driver {name} cannot be loaded: {type(fault).__name__}: {fault}"
-            raise BadUrl(ascii(url), "open device", detail, "install Abbe and the package that offers the driver again") from fault
+            if name.startswith("abbe.drivers."):
+                detail = f"the driver {name} cannot be loaded: {type(fault).__name__}: {fault}"
+                raise BadUrl(ascii(url), "open device", detail, "install Abbe again") from fault
 
 
 async def open_ballbar(url: str) -> BallBar:

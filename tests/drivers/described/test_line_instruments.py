@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import shutil
 from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
@@ -68,12 +69,17 @@ async def until_it_raises(ask: Callable[[], Awaitable[object]]) -> None:
         await ask()
 
 
-def person(value: Path, rest: str, moved: dict[str, str]) -> Callable[[str], Awaitable[None]]:
-    """Somebody who changes what is measured when he is asked: the words of the question say what it is then."""
+def person(value: Path, rest: str, moved: dict[str, str], *, sent: Path | None = None) -> Callable[[str], Awaitable[None]]:
+    """Somebody who changes what is measured when he is asked: the words of the question say what it is then.
+
+    ``sent``: file in which an instrument notes what it has sent; the person answers only after it shows the change.
+    """
 
     async def act(text: str) -> None:
         now = next((what for words, what in moved.items() if words in text), rest)
         put(value, now)
+        if sent is not None:
+            await asyncio.to_thread(wait_for, lambda: sent.exists() and sent.read_text().strip() == now, "the instrument sends the change")
 
     return act
 
@@ -117,7 +123,7 @@ async def test_what_is_wrong_with_a_gauge_is_named(value: Path, away: str, why: 
 async def test_a_streaming_sensor_on_a_serial_line_passes(value: Path, tmp_path: Path) -> None:
     put(tmp_path / "sensor.toml", SENSOR)
     put(value, "100.0 0")
-    ask = person(value, "100.0 0", {"AWAY": "105.0 0", "Block": "100.0 1"})
+    ask = person(value, "100.0 0", {"AWAY": "105.0 0", "Block": "100.0 1"}, sent=tmp_path / "value.sent")
     with over_pty("sensor", value, tmp_path) as url:
         report = await device_test(f"{url}?device={tmp_path / 'sensor.toml'}&baud=9600", options(ask), UTC)
     assert report.failed == ()
