@@ -5,19 +5,25 @@ its URL scheme (docs/how-to/own-device.md)::
 
     [project.entry-points."abbe.drivers"]
     "acme+tcp" = "acme_driver:DRIVER"      # DRIVER = {"cnc": open_controller}; async def open_controller(url: str) -> Controller
-
-A driver is imported with its first device: a command waits only for the drivers that its machine has.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from importlib import import_module
 from importlib.metadata import EntryPoint
-from typing import TYPE_CHECKING, cast
+from typing import cast
 
 from abbe.drivers.api import BallBar, Controller, DeviceInfo, DisplacementMeter, Fixture, OneBank, Tables, has_one_table
+from abbe.drivers.ballbar.driver import SerialBallBar
+from abbe.drivers.cnc.driver import ModbusController
+from abbe.drivers.described.control import ListenedControl
+from abbe.drivers.described.opening import open_control, open_meter
+from abbe.drivers.described.tested import Ability, check_tested
 from abbe.drivers.errors import BadUrl, NotProved
+from abbe.drivers.fixture.driver import Ask, ConsoleFixture, RemoteFixture
+from abbe.drivers.laser.driver import ModbusLaser
+from abbe.drivers.links.modbus_link import Canary, ModbusLink
+from abbe.drivers.links.serial_link import ByteLink
 from abbe.drivers.links.urls import (
     FixtureConsoleUrl,
     FixtureTcpUrl,
@@ -30,46 +36,10 @@ from abbe.drivers.links.urls import (
     parse_url,
     split_report,
 )
-
-if TYPE_CHECKING:
-    from abbe.drivers.fixture.driver import Ask
-    from abbe.drivers.links.modbus_link import ModbusLink
+from abbe.drivers.one_bank import OneBankTables
 
 HEARTBEAT_S = 1.0
 """Seconds between canary reads of an idle controller or laser, so that a loss is detected within 3 s."""
-
-
-_MODULES = {"ballbar": "ballbar.driver", "laser": "laser.driver", "cnc": "cnc.driver", "fixture": "fixture.driver"}
-
-
-def load(role: str, url: str) -> None:
-    """Import the driver that opens a URL for a role, which takes up to a second: in a thread, as open links have to go on.
-
-    What is wrong with the URL, or with a driver of an installed package, is told by the opening of the device.
-
-    Raises
-    ------
-    BadUrl
-        A driver of this program cannot be imported.
-    """
-    try:
-        if (entry := installed(url)) is not None:
-            names = [entry.value.partition(":")[0], "abbe.drivers.one_bank", "abbe.drivers.described.tested"]
-        elif role != "fixture" and described_by(parse_url(url)):
-            names = ["abbe.drivers.described.opening", "abbe.drivers.described.tested"]
-        else:
-            parse_url(url)
-            links = {"ballbar": ["abbe.drivers.links.serial_link"], "fixture": []}.get(role, ["abbe.drivers.links.modbus_link"])
-            names = [f"abbe.drivers.{_MODULES[role]}", *links]
-    except BadUrl:
-        return
-    for name in names:
-        try:
-            import_module(name)
-        except Exception as fault:  # an import of foreign code may raise anything
-            if name.startswith("abbe.drivers."):
-                detail = f"the driver {name} cannot be loaded: {type(fault).__name__}: {fault}"
-                raise BadUrl(ascii(url), "open device", detail, "install Abbe again") from fault
 
 
 async def open_ballbar(url: str) -> BallBar:
@@ -87,10 +57,6 @@ async def open_ballbar(url: str) -> BallBar:
     parsed = parse_url(url)
     if not isinstance(parsed, SerialUrl | SocketUrl):
         raise _wrong_scheme(url, "a ball-bar", "serial:// or socket://")
-
-    from abbe.drivers.ballbar.driver import SerialBallBar
-    from abbe.drivers.links.serial_link import ByteLink
-
     ballbar = SerialBallBar(ByteLink(parsed))
     await _identify_or_close(ballbar)
     return ballbar
@@ -113,13 +79,7 @@ async def open_laser(url: str) -> DisplacementMeter:
     if (entry := installed(url)) is not None:
         return cast(DisplacementMeter, await _opened(entry, "laser", url))
     if described_by(parsed := parse_url(url)):
-        from abbe.drivers.described.opening import open_meter
-        from abbe.drivers.described.tested import Ability
-
         return await open_meter(parsed, needed=Ability.DWELL)
-
-    from abbe.drivers.laser.driver import ModbusLaser
-
     laser = ModbusLaser(await _modbus(url, "a laser"))
     await _identify_or_close(laser)
     return laser
@@ -140,18 +100,11 @@ async def open_controller(url: str) -> Controller:
         Communication failed.
     """
     if (entry := installed(url)) is not None:
-        from abbe.drivers.one_bank import OneBankTables
-
         found = cast(Controller, await _opened(entry, "cnc", url))
         controller = cast(Controller, OneBankTables(cast(OneBank, found))) if has_one_table(found) else found
     elif described_by(parsed := parse_url(url)):
-        from abbe.drivers.described.opening import open_control
-        from abbe.drivers.described.tested import Ability
-
         return await open_control(parsed, needed=Ability.DWELL)
     else:
-        from abbe.drivers.cnc.driver import ModbusController
-
         controller = ModbusController(await _modbus(url, "a controller"))
     await _identify_or_close(controller)
     return controller
@@ -159,8 +112,6 @@ async def open_controller(url: str) -> Controller:
 
 def no_controller() -> Controller:
     """Return the stand-in for a control that is not connected: an operator runs the NC program, and the position is unknown."""
-    from abbe.drivers.described.control import ListenedControl
-
     return ListenedControl(None, None)
 
 
@@ -176,8 +127,6 @@ async def open_fixture(url: str, ask: Ask) -> Fixture:
     LinkDown
         No connection.
     """
-    from abbe.drivers.fixture.driver import ConsoleFixture, RemoteFixture
-
     parsed = parse_url(url)
     if isinstance(parsed, FixtureConsoleUrl):
         return ConsoleFixture(ask)
@@ -204,8 +153,6 @@ async def _opened(entry: EntryPoint, role: str, url: str) -> object:
         raise BadUrl(
             ascii(url), "open device", f"the driver {entry.value} opens no {role}", f"name a driver for {role} under [devices] {role}"
         )
-    from abbe.drivers.described.tested import Ability, check_tested
-
     bare, report = split_report(url)
     device = await driver[role](bare)
     needed = {name for name in dir(ROLES[role]) if name[0] != "_"}
@@ -230,9 +177,6 @@ async def _modbus(url: str, what: str) -> ModbusLink:
     parsed = parse_url(url)
     if not isinstance(parsed, ModbusTcpUrl | ModbusRtuUrl):
         raise _wrong_scheme(url, what, "modbus+tcp:// or modbus+rtu://")
-
-    from abbe.drivers.links.modbus_link import Canary, ModbusLink
-
     return await ModbusLink.connect(parsed, canary=Canary(), heartbeat_s=HEARTBEAT_S)
 
 

@@ -2,7 +2,8 @@
 
 ``scipy.stats`` has the same functions, but its import costs every command most of a second of processor time.
 ``..._below(x)`` is the probability of a smaller value, ``..._above(x)`` that of a larger one; ``..._quantile(p)`` is the value with
-probability p below it. Arguments may be arrays; for t, degrees of freedom may be infinite. `abbe.models.student` has what a trend needs.
+probability p below it, ``..._limit(p)`` the value with probability p above it. Arguments may be arrays; for t, degrees of freedom may be
+infinite.
 """
 
 from __future__ import annotations
@@ -24,10 +25,21 @@ def normal_above(z: ArrayLike) -> F1:
     return np.asarray(scipy.special.ndtr(-np.asarray(z, dtype=float)))
 
 
+def normal_limit(p: ArrayLike) -> F1:
+    """Return the value above which a standard normal variable lies with probability ``p``; inf for p = 0."""
+    return np.asarray(-scipy.special.ndtri(p))
+
+
 def t_quantile(p: ArrayLike, dof: ArrayLike) -> F1:
     """Return the quantile of Student's t; with infinite ``dof``, that of the normal distribution."""
     many = np.isinf(dof)
     return np.asarray(np.where(many, scipy.special.ndtri(p), scipy.special.stdtrit(np.where(many, 1.0, dof), p)))
+
+
+def t_above(t: ArrayLike, dof: ArrayLike) -> F1:
+    """Return the probability that Student's t is above ``t``; with infinite ``dof``, that of the normal distribution."""
+    many, lower = np.isinf(dof), -np.asarray(t, dtype=float)
+    return np.asarray(np.where(many, scipy.special.ndtr(lower), scipy.special.stdtr(np.where(many, 1.0, dof), lower)))
 
 
 def chi2_quantile(p: ArrayLike, dof: ArrayLike) -> F1:
@@ -43,3 +55,11 @@ def chi2_above(x: ArrayLike, dof: ArrayLike) -> F1:
 def f_above(x: ArrayLike, dof: ArrayLike, dof_below: ArrayLike) -> F1:
     """Return the probability that F is above ``x``; 1 for x <= 0."""
     return np.asarray(scipy.special.fdtrc(dof, dof_below, np.maximum(x, 0.0)))
+
+
+def f_limit(p: ArrayLike, dof: ArrayLike, dof_below: ArrayLike) -> F1:
+    """Return the value above which F lies with probability ``p``."""
+    half, half_below = 0.5 * np.asarray(dof, dtype=float), 0.5 * np.asarray(dof_below, dtype=float)
+    # rest = 1 - share, computed on its own: the subtraction would lose digits where rest is small.
+    share, rest = scipy.special.betainccinv(half, half_below, p), scipy.special.betaincinv(half_below, half, p)
+    return np.asarray(half_below * share / (half * rest))

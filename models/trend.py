@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from abbe.models.arrays import F1
-from abbe.models.probability import normal_below
-from abbe.models.student import f_limit_2, normal_limit, t_above, t_limit
+from abbe.models.probability import f_limit, normal_below, normal_limit, t_above
 
 CUSUM_K = 0.5
 """Reference value of the CUSUM: half the smallest shift worth finding, in standard deviations of a check."""
@@ -246,7 +245,7 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     slope = float(sums.slope()[best])
     slope_and_u = (slope, float(np.sqrt(scale2 * sums.w / (sums.w * sums.rr[best] - sums.r[best] ** 2))))
     flat = sums.yy - sums.y**2 / sums.w
-    if (flat - left[best]) / (2 * scale2) <= f_limit_2(SIGNIFICANCE, n - 3):
+    if (flat - left[best]) / (2 * scale2) <= f_limit(SIGNIFICANCE, 2, n - 3):
         return Forecast(np.nan, np.nan, np.nan, "not known: the slope is not significant", *slope_and_u)
     if slope < 0:
         return Forecast(np.nan, np.nan, np.nan, "moves away from the limit", *slope_and_u)
@@ -255,7 +254,7 @@ def forecast(days: F1, values: F1, u: F1, limit: float | None, level: float = 0.
     # Beside the day itself the grid is as fine as the narrowest interval that rounding leaves.
     near = reached * (1.0 + np.concatenate([-np.geomspace(1e-6, 0.1, 120), np.geomspace(1e-6, 0.1, 120)]))
     ahead = np.unique(np.concatenate([[0.0, reached], near, span * np.geomspace(1e-3, FARTHEST, 600)]))
-    inside = np.flatnonzero(sums.squares_if(ahead) - left[best] <= scale2 * t_limit((1 - level) / 2, n - 3) ** 2)
+    inside = np.flatnonzero(sums.squares_if(ahead) - left[best] <= scale2 * f_limit(1 - level, 1, n - 3))
     if reached == 0.0 and not len(inside):
         return Forecast(0.0, 0.0, 0.0, "", *slope_and_u)
     if reached > span * FARTHEST or not len(inside) or inside[-1] == len(ahead) - 1:

@@ -32,8 +32,6 @@ VERTICAL = 1
 CENTRE_MM = np.array([290.0, 240.0, 200.0])
 DEAD_PATH_MM = 900.0
 STEP_S = 5.0
-SEARCHED_SCATTER = ("stick_slip", "vibration", "beam_outliers", "bar_outliers")
-"""The effects that add scatter to the readings. The search has a test of its own for each of them, and none for others."""
 SENSORS = ("x", "y", "z", "spindle", "air")
 
 
@@ -50,10 +48,7 @@ def declaration_faults(effect: Effect) -> tuple[str, ...]:
         (0.0 < low <= high, f"typical {effect.typical}: expected two positive numbers, the smaller first"),
         (effect.family in get_args(Family), f"family {effect.family!r}: expected one of {', '.join(get_args(Family))}"),
         (effect.remedy in get_args(Remedy), f"remedy {effect.remedy!r}: expected one of {', '.join(get_args(Remedy))}"),
-        (
-            effect.kind == "mean" or effect.name in SEARCHED_SCATTER,
-            f"kind {effect.kind!r}: expected mean; only {', '.join(SEARCHED_SCATTER)} add scatter",
-        ),
+        (effect.kind in ("mean", "variance"), f"kind {effect.kind!r}: expected mean or variance"),
         (set(effect.blind) < set(TESTS), f"blind {effect.blind}: expected names from {', '.join(TESTS)}, but not all of them"),
         (
             all(set(v) <= set(ADDS) and v for v in effect.separated_by.values()),

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from abbe.models.arrays import F1, F2, F3
-from abbe.models.student import t_above
+from abbe.models.probability import t_above
 
 REFERENCE_C = 20.0
 """Reference temperature, ISO 1."""

@@ -9,7 +9,6 @@ Every controller status is noted with its arrival time (`notes_since`): many suc
 
 from __future__ import annotations
 
-import asyncio
 import errno
 import hashlib
 import os
@@ -317,23 +316,22 @@ async def open_session(
     async with AsyncExitStack() as stack:
         troubles: list[DriverError] = []
 
-        async def opened(role: str, url: str, opening: Callable[[str], Awaitable[D]]) -> D | None:
+        async def opened(device: Awaitable[D]) -> D | None:
             try:
-                await asyncio.to_thread(registry.load, role, url)
-                found = await opening(url)
+                found = await device
             except DriverError as error:
                 troubles.append(error)
                 return None
             stack.push_async_callback(found.close)
             return found
 
-        found = registry.no_controller() if urls.cnc is None else await opened("cnc", urls.cnc, registry.open_controller)
+        found = registry.no_controller() if urls.cnc is None else await opened(registry.open_controller(urls.cnc))
         controller = None if found is None else noted(found)
         if controller is not None and first is not None:
             await first(controller)
-        ballbar = None if urls.ballbar is None else await opened("ballbar", urls.ballbar, registry.open_ballbar)
-        laser = None if urls.laser is None else await opened("laser", urls.laser, registry.open_laser)
-        fixture = None if urls.fixture is None else await opened("fixture", urls.fixture, lambda url: registry.open_fixture(url, ask))
+        ballbar = None if urls.ballbar is None else await opened(registry.open_ballbar(urls.ballbar))
+        laser = None if urls.laser is None else await opened(registry.open_laser(urls.laser))
+        fixture = None if urls.fixture is None else await opened(registry.open_fixture(urls.fixture, ask))
         raise_all(troubles)
         assert controller is not None
         yield Session(controller, ballbar, None if laser is None else noted_meter(laser), fixture, ask is not no_console)

@@ -115,6 +115,8 @@ def _fault(found: list[Effect], taken: set[str]) -> str:
     for effect in found:
         if effect.name in taken or names.count(effect.name) > 1:
             return f"the name {effect.name!r} is taken"
+        if effect.kind != "mean":  # each effect of scatter has a test of its own in the search
+            return f"{effect.name}: kind {effect.kind!r}: expected 'mean', as nothing searches for the scatter of an effect from outside"
         try:
             with np.errstate(all="ignore"):
                 faults = declaration_faults(effect) or signal_faults(effect, probe_paths())

@@ -4,12 +4,15 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from abbe.drivers import api
 from abbe.drivers.api import Condition
 from abbe.drivers.cnc.registers import conditions_of, interlocks
+from abbe.drivers.errors import Refused
+from abbe.drivers.one_bank import FORBIDDEN, NEEDED, OneBankTables
 
 PROTOCOLS = Path(__file__).parents[2] / "docs" / "protocols"
 WORDS = {
@@ -75,3 +78,15 @@ def test_the_laser_says_that_it_counts(word: int):
     assert api.signal_is_there(word) == (not (low or missing))
     assert api.is_zeroed(word) == zeroed
     assert api.air_is_compensated(word) == compensated
+
+
+@pytest.mark.parametrize("flag", [*FORBIDDEN, *NEEDED], ids=lambda flag: flag.name)
+async def test_a_control_with_one_table_says_why_it_is_not_safe(flag: Condition) -> None:
+    """Wrong is a forbidden condition that holds, or a needed one that does not."""
+
+    class Control:
+        async def status(self) -> SimpleNamespace:
+            return SimpleNamespace(conditions=NEEDED ^ flag)
+
+    with pytest.raises(Refused, match=f"not safe now: {api.WRONG_STATES[flag]}$"):
+        await OneBankTables(Control())._safe()  # type: ignore[arg-type]

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from abbe.drivers.errors import BadUrl
 from abbe.drivers.links.urls import PARITIES, FixtureConsoleUrl, FixtureTcpUrl, ModbusRtuUrl, ModbusTcpUrl, SerialUrl, SocketUrl, parse_url
-from abbe.drivers.registry import load
 
 paths = (
     st.text(st.characters(codec="utf-8", exclude_categories=["C"]), min_size=1)
@@ -111,22 +108,3 @@ def test_any_text_is_understood_or_refused(text):
         message = ""
         assert parse_url(str(url)) == url
     assert "\n" not in message
-
-
-@pytest.mark.parametrize(
-    ("role", "url"),
-    [
-        ("cnc", "modbus+tcp://127.0.0.1:502"),
-        ("laser", "modbus+tcp://127.0.0.1:502?device=abbe-laser"),
-        ("ballbar", "socket://127.0.0.1:1"),
-        ("fixture", "fixture+console:"),
-    ],
-)
-def test_every_role_has_a_driver_to_load(role, url):
-    load(role, url)
-
-
-def test_a_driver_that_cannot_be_imported_is_a_fault_of_its_device(monkeypatch):
-    monkeypatch.setitem(sys.modules, "abbe.drivers.ballbar.driver", None)
-    with pytest.raises(BadUrl, match=r"abbe\.drivers\.ballbar\.driver cannot be loaded: ModuleNotFoundError"):
-        load("ballbar", "socket://127.0.0.1:1")

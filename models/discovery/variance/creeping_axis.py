@@ -39,7 +39,7 @@ def _moves(path: Path, axis: int) -> bool:
 
 
 @dataclass(frozen=True)
-class Scatter:
+class AxisScatter:
     """Scatter along an axis at any speed. ``gain``: gain in log likelihood; ``height_mm``: half height of teeth that scatter as much;
     ``u_mm``: its standard uncertainty.
     """
@@ -49,7 +49,7 @@ class Scatter:
     u_mm: float
 
 
-def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> Scatter:
+def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigma_mm: tuple[float, ...]) -> AxisScatter:
     """Find scatter along an axis, beside scatter along the other axes.
 
     Parameters
@@ -60,7 +60,7 @@ def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigm
 
     Returns
     -------
-    Scatter
+    AxisScatter
         The gain is that of the squared residuals, but at most that of the squared second differences, which leave out deviations that
         neighbours share. It is 0 if less than `IN_RUNS` of the runs show the scatter in both.
     """
@@ -73,7 +73,7 @@ def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigm
     (rough, _, _), (raw, variance, u) = (f.gain(along) for f in fits)
     shown = [np.bincount(run[read], f.by_reading(along)[0], len(paths))[moving] > 0.0 for f in fits]
     gain = min(rough, raw) if np.mean(shown[0] & shown[1]) >= IN_RUNS else 0.0
-    return Scatter(gain, *height(variance, u))
+    return AxisScatter(gain, *height(variance, u))
 
 
 def without_band(frequency_hz: float, axis: int, path: Path, rest: F1) -> F1:

@@ -75,7 +75,6 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
         A schedule names an unknown recipe, its paths leave the machine's strokes, or a device that it needs is not configured. Reported
         now, not at the first slot in the night.
     """
-    from abbe.drivers.registry import load as load_driver
     from abbe.service.campaigns.plausibility import check_plausibility, check_unattended
     from abbe.service.capture.live import LiveFeed
     from abbe.service.clock import SystemClock
@@ -93,8 +92,6 @@ def setup_of(loaded: LoadedMachine, port: int | None = None) -> ServiceSetup:
     config = loaded.machine
     check_unattended(config, loaded.path.resolve().parent)
     site, live = site_of(config), LiveFeed()
-    for role in site.urls.named():  # now: a driver that is missing or is replaced later must not surprise a service that moves a machine
-        load_driver(role, getattr(site.urls, role))
 
     def check_on(store: Store) -> Check:
         async def check(recipe: str, progress: ProgressSink, control: Control) -> CheckResult:

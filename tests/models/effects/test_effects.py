@@ -52,11 +52,6 @@ def test_an_effect_is_declared_and_behaves(effect: Effect) -> None:
     assert effect.unit == STRENGTH_UNITS.get(effect.name, "um")  # run-format.md 5
 
 
-def test_an_effect_from_outside_that_adds_scatter_is_refused_as_nothing_searches_for_it() -> None:
-    (fault,) = declaration_faults(replace(BY_NAME["stick_slip"], name="shop_scatter"))
-    assert fault.startswith("kind 'variance': expected mean")
-
-
 def test_the_names_are_those_of_the_exchange_format() -> None:
     assert len(BY_NAME) == len(CATALOGUE) == 28
     known = set(BY_NAME) | {e.label(k) for e, k in LABELS}
@@ -101,7 +96,6 @@ def test_an_effect_of_an_axis_is_the_same_on_another_axis(effect: Effect, key: s
 
 def renamed(path: Path) -> Path:
     """The same run with the axes renamed in a circle."""
-    from dataclasses import replace
 
     def roll(a: F2) -> F2:
         return np.roll(a, 1, axis=-1)

@@ -19,7 +19,7 @@ from tests.patience import within
 URL = "modbus+tcp://127.0.0.1:1"
 NOBODY = 65534
 HOLDER = """
-import fcntl, os, sys
+import os, sys
 from abbe.service.devices.session import lock_machine
 uid, gid, url = int(sys.argv[1]), int(sys.argv[2]), sys.argv[3]
 if uid:  # after the imports: what this account may read of the installation is not what is tried here

@@ -69,6 +69,10 @@ def test_an_effect_of_another_package_is_found_and_another_beside_it_too(site: P
         ("EFFECT = ()", "offers no effect"),
         ("x = 1", "AttributeError"),
         (GOOD.format(name="backlash", slope=1.0), "the name 'backlash' is taken"),
+        (
+            GOOD.format(name="shop_scatter", slope=1.0).replace('source="our shop"', 'source="our shop", kind="variance"'),
+            "shop_scatter: kind 'variance': expected 'mean'",
+        ),
         (GOOD.format(name="Clamp Step", slope=1.0), "lower-case letters"),
         (GOOD.format(name="clamp_step", slope="np.nan"), "not finite"),
         (GOOD.format(name="clamp_step", slope="missing"), "NameError"),
