@@ -463,7 +463,7 @@ class Mistake:
 
     @property
     def path(self) -> str:
-        """The place with dots, each part at most 100 characters."""
+        """The place as a dotted path; each part is cut to 100 characters."""
         return ".".join(str(part)[:100] for part in self.place)
 
     @property

@@ -98,9 +98,9 @@ def turn_vector(rotation_rad: F2, v_mm: F2) -> F2:
 
 
 def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
-    """Return (R − I) v for R = Rz(EC) Ry(EB) Rx(EA); with ``reverse``, for R = Rx(EA) Ry(EB) Rz(EC), the inverse of the first R for −E.
+    """Return (R − I) v for R = Rz(EC) Ry(EB) Rx(EA), or, with ``reverse``, for R = Rx(EA) Ry(EB) Rz(EC).
 
-    Shapes are those of `turn_vector`.
+    The reverse R of the angles −E is the inverse of the other R of the angles E. Shapes are those of `turn_vector`.
     """
     added = np.zeros(np.broadcast(rotation_rad, v_mm).shape)
     for k in (2, 1, 0) if reverse else (0, 1, 2):

@@ -179,7 +179,7 @@ def _gaps() -> F2:
 
 
 def _projected(kernel: F2, first: int, last: int) -> F2:
-    """Covariance of the Legendre coefficients of a process with this covariance at the nodes of the quadrature."""
+    """Covariance of the Legendre coefficients of a process. ``kernel``: that of the process at the nodes of the quadrature."""
     u, weight = legendre.leggauss(NODES)
     project = (np.arange(first, last + 1) + 0.5)[:, None] * legendre.legvander(u, last)[:, first:].T * weight
     return np.asarray(project @ kernel @ project.T)

@@ -269,7 +269,7 @@ def _ends_s(records: list[RunRecord]) -> tuple[float, float]:
 def propose(site: Site, runs: list[Run], base: Base, lsb_nm: int, *, without_scale: bool = False) -> Proposal:
     """Solve runs that were measured while ``base`` was active, and add their correction to it. ``lsb_nm``: the controller's unit, nm.
 
-    ``without_scale``: leave out the scales that are the largest part of the uncertainty; the tables in force keep theirs.
+    ``without_scale``: do not correct the scales, the largest part of the uncertainty; those of the tables in force stay.
 
     Raises
     ------

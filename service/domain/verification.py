@@ -59,7 +59,7 @@ class Verification:
 
 @dataclass(frozen=True, slots=True)
 class CheckResult:
-    """Result of a check. ``uncertainties`` are expanded (k = 2); figures in µm by name."""
+    """Result of a check. ``values``, ``uncertainties`` (expanded, k = 2) and ``limits`` are in µm, by the name of the figure."""
 
     verdict: Verdict
     values: dict[str, float]

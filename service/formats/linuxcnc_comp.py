@@ -64,7 +64,7 @@ def _read_one(file: TextFile, kind: int) -> AxisTable:
         cells = text.split()
         if len(cells) != 3:
             found = "is blank" if not cells else f"is {text.strip()!r}"
-            raise file.wrong(line, f"the line {found}: LinuxCNC ends the table here without an error", "write only lines of three numbers")
+            raise file.wrong(line, f"the line {found}: LinuxCNC would stop reading here, silently", "write only lines of three numbers")
         rows.append([file.number(line, w, n) for w, n in zip(cells, ("the position", "forward", "reverse"), strict=True)])
         lines.append(line)
     if not rows:

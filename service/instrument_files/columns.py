@@ -1,4 +1,4 @@
-"""Any table of readings (CSV, TSV, XLSX) with a file that describes its columns, or with questions about them."""
+"""Import of any table of readings (CSV, TSV, XLSX). A file describes its columns; without one, Abbe asks about each column."""
 
 from __future__ import annotations
 

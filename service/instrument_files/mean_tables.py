@@ -71,7 +71,7 @@ def _pos_tables(file: TextFile) -> tuple[dict[float, Table], dict[str, str], int
         if head is not None:
             way = _WAYS[head.group(1)]
             if way in tables:
-                raise file.wrong(line, f"a second table of {head.group(1)} means")
+                raise file.wrong(line, f"the file has two tables of {head.group(1)} means")
             now = tables.setdefault(way, ([], [], [], []))
         elif _OTHER_HEAD.match(text):
             raise file.wrong(line, f"{text.strip()[:60]!r} is not a known table", "send the file to the people who write Abbe")

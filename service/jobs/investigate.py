@@ -204,9 +204,7 @@ def check_cause(promised: Predicted, against: str, rms_um: float) -> None:
     """
     gain_um = (promised.before_mm - promised.after_mm) * 1e3
     if against and rms_um > BESIDE * gain_um:
-        raise TableRefused(
-            f"tables may be unable to correct {rms_um:.1f} µm rms of the readings, and promise a gain of only {gain_um:.1f} µm", against
-        )
+        raise TableRefused(f"tables may not reach {rms_um:.1f} µm rms of the readings; the promised gain is only {gain_um:.1f} µm", against)
 
 
 def promise_text(store: Store, made: StoredProposal) -> str:

@@ -135,7 +135,7 @@ def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
         if entry.digest != digest_of(entry.push, entry.seq, entry.state, entry.doc, entry.utc, entry.prev):
             raise JournalBroken(f"{name}: was changed after it was written")
         if entry.seq != (before.seq + 1 if before else 0) or not _may_follow(entry.push, before.state if before else None, entry.state):
-            raise JournalBroken(f"{name}: {entry.state} cannot follow the push's entry before it")
+            raise JournalBroken(f"{name}: {entry.state} is not allowed after the previous entry of this push")
         last[entry.push], head = entry, entry.digest
 
 

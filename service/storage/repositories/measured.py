@@ -357,7 +357,7 @@ class Chunks(Repository):
         return {(row.channel, row.seq): row.crc32 for row in self._db.read(lambda connection: connection.execute(query).all())}
 
     def channels(self, run_id: int) -> list[ChannelRecord]:
-        """List the channels of a run with the numbers of their chunks and samples."""
+        """List the channels of a run. Each says how many chunks and samples it has."""
         columns = (chunks.c.channel, func.min(chunks.c.codec), func.count(), func.sum(chunks.c.n))
         query = select(*columns).where(chunks.c.run_id == run_id).group_by(chunks.c.channel).order_by(chunks.c.channel)
         rows = self._db.read(lambda connection: connection.execute(query).all())

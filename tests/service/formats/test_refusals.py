@@ -23,7 +23,7 @@ KINS = "COUNT[3] = {2, 2, 2};\nFIRST[3] = {0, 0, 0}, STEP[3] = {1, 1, 1};\nstati
 CENTROID = "CNC10 TAB FILE VERSION 3\nAXIS X\nUNITS MM\nINTERVAL 25\nENTRIES 3\n"
 MACH4 = "axis,X\nstart_mm,0\nlength_mm,10\npoints,3\npoint,position_mm,error_plus_mm,error_minus_mm\n"
 BAD_FILES = [
-    ("linuxcnc-1", "x.comp", "# made by hand\n0 0 0\n100 0.01 0.01\n", r"x\.comp:1: .*ends the table here"),
+    ("linuxcnc-1", "x.comp", "# made by hand\n0 0 0\n100 0.01 0.01\n", r"x\.comp:1: .*would stop reading here"),
     ("linuxcnc-1", "x.comp", "0 0 0\n\n100 0.01 0.01\n", r"x\.comp:2: the line is blank"),
     ("linuxcnc-1", "x.comp", "0 0 0\n100,0.01,0.01\n", r"x\.comp:2: "),
     ("linuxcnc-1", "x.comp", "0 0 0\n100 0.01 0.01\n50 0.02 0.02\n", r"x\.comp:3: position 50 after 100"),
