@@ -82,7 +82,7 @@ def machine_text(
         Last day of the certificate of ``ballbar``, ``laser`` and ``artefact``; an instrument without a certificate gets a comment
         instead.
     limits : PushLimits, optional
-        Limits of a table; only those that differ from the defaults are written.
+        Limits of a table; of these the largest value, change and change over 30 days are written. None: nothing.
     verify : bool
         Also write the limits of a check, which decide whether the machine passes.
     """

@@ -1,4 +1,4 @@
-"""Declaration of a physical effect: everything that discovery, reports and the self-test need to know about the effect."""
+"""Declaration of a physical effect, for discovery, reports and the self-test. `models.discovery.residues` knows what resembles it."""
 
 from __future__ import annotations
 

@@ -143,3 +143,11 @@ def test_the_example_needs_only_addresses_for_a_first_check() -> None:
     machine = load_machine(ROOT / "deploy" / "machine.example.toml").machine
     assert machine.verify.body_diagonal_um is not None
     assert {"ballbar", "laser", "cnc", "fixture"} <= set(machine.devices.model_dump(exclude_none=True))
+
+
+def test_every_reason_against_a_push_is_told() -> None:
+    told = re.findall(r"^\| ([A-Z, ]+) \|", (ROOT / "docs" / "how-to" / "propose.md").read_text(encoding="utf-8"), re.MULTILINE)
+    judges = ("push/validate.py", "compensation/gate.py")
+    given = {word for one in judges for word in re.findall(r'"([A-Z]{3,}): ', (ROOT / "service" / one).read_text(encoding="utf-8"))}
+    assert len(given) > 30
+    assert given - set(", ".join(told).split(", ")) == set()

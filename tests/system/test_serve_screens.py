@@ -73,7 +73,7 @@ class Watch:
     def _complained(self, message: ConsoleMessage) -> None:
         # The last is the browser's own: without a GPU it reads a canvas of WebGL back for every screenshot.
         if message.type in {"error", "warning"} and "GPU stall due to ReadPixels" not in message.text:
-            self.errors.append(message.text)
+            self.errors.append(f"{message.text} {message.location.get('url', '')}".strip())
 
 
 @pytest.fixture(scope="module")
