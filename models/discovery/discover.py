@@ -24,7 +24,7 @@ from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extr
 from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
 from abbe.models.effects.effect import Effect
 
-Progress = Callable[[str, float], None]
+ShareSink = Callable[[str, float], None]
 Search = tuple[WhitenedProblem, Contest, list[Selection], tuple[VarianceFinding, ...]]
 CLEAR = 1.0
 """A rival replaces a named effect if its chi-square is lower by at least this; a new name needs the same margin."""
@@ -81,7 +81,7 @@ def _burst(problem: WhitenedProblem, t0_s: float, width_s: float) -> F1:
     return np.concatenate([(np.abs(p.at.t_s - t0_s) < 1.5 * width_s) * float(p.kind == "bar") for p in problem.paths])
 
 
-def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | None = None) -> Discovery:
+def discover(case: Case, effects: tuple[Effect, ...], *, progress: ShareSink | None = None) -> Discovery:
     """Find the effects that the present simulation of a campaign lacks.
 
     Parameters
@@ -119,7 +119,7 @@ def discover(case: Case, effects: tuple[Effect, ...], *, progress: Progress | No
     return replace(named, alone=finding(plain, plain, (), (), empty, (), (before, before)))
 
 
-def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: Progress) -> Search:
+def searched(problem: WhitenedProblem, effects: tuple[Effect, ...], tell: ShareSink) -> Search:
     """Search for mean and variance effects and refit noise and simulation, up to `ROUNDS` times, until the findings stay the same."""
     contest = Contest.of(problem, effects)
     found, loud, start = selected(contest), tuple[VarianceFinding, ...](), list[Pick]()

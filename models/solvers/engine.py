@@ -105,7 +105,7 @@ SETTLED = 0.02
 """The iteration ends when no predicted reading moves, and no weight changes, by more than this (readings in units of their noise)."""
 HUBER = 1.5
 GENTLE = 3
-Progress = Callable[[str], None]
+StageSink = Callable[[str], None]
 
 
 @dataclass(frozen=True)
@@ -271,7 +271,7 @@ def build(machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], 
     return CampaignProblem(machine, runs, terms, setup, names, sizes, noise, sigma, readings)
 
 
-def settle(problem: CampaignProblem, report: Progress) -> CampaignFit:
+def settle(problem: CampaignProblem, report: StageSink) -> CampaignFit:
     """Iterate weights, components and the exact model to convergence."""
     r = problem.readings
     gram, measured, sizes = grams(r), problem.measured, problem.sizes

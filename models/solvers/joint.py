@@ -25,7 +25,7 @@ from abbe.models.solvers.engine import (
     CampaignFit,
     CampaignProblem,
     InstrumentNoise,
-    Progress,
+    StageSink,
     build,
     expected_noise,
     rough_evidence,
@@ -207,7 +207,7 @@ def solve_joint(  # noqa: PLR0913 - every one of them is a choice of the caller,
     sigma_mm: dict[str, float] | None = None,
     floor_mm: dict[str, float] | None = None,
     priors: Priors | None = None,
-    progress: Progress | None = None,
+    progress: StageSink | None = None,
 ) -> JointSolution:
     """Solve all runs of a campaign together.
 
@@ -267,7 +267,7 @@ def settled_points(machine: Machine, runs: tuple[RunData, ...], priors: Priors) 
 
 
 def _again(
-    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: InstrumentNoise, report: Progress
+    machine: Machine, terms: tuple[Term, ...], runs: tuple[RunData, ...], priors: Priors, noise: InstrumentNoise, report: StageSink
 ) -> tuple[CampaignProblem, CampaignFit]:
     problem = build(machine, terms, runs, priors, noise)
     return problem, settle(problem, report)

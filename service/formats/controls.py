@@ -15,7 +15,6 @@ import numpy as np
 from abbe.models.arrays import F1, F2
 from abbe.models.geometry.volume import remove_rigid, volume_grid
 from abbe.models.machine import AXES
-from abbe.service.errors import FormatRefused
 from abbe.service.formats.identified import Identified, Values, axis_tables, grid_mm, lattice_of, motions_of, products_of, table_values
 from abbe.service.formats.model import AxisCurve, AxisTable, Compensation, Lattice, Lookup, Motions, ProductTable, correction_at
 
@@ -130,19 +129,6 @@ CONTROLS: dict[str, ControlModel] = {
         ControlModel("grblhal", "grblHAL: lost motion", lines_format="grblhal", squareness=False),
     )
 }
-
-
-def control_of(key: str) -> ControlModel:
-    """Return the control with this key.
-
-    Raises
-    ------
-    FormatRefused
-        The key is unknown; the message lists the known ones.
-    """
-    if key not in CONTROLS:
-        raise FormatRefused(f"there is no control {key!r}", f"known are {', '.join(CONTROLS)}")
-    return CONTROLS[key]
 
 
 JUDGE_NODES, COARSE_NODES = 12, 6
