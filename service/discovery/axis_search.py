@@ -10,7 +10,7 @@ from abbe.models.arrays import F1
 from abbe.models.discovery.answer import Discovery, Fitted, Significance
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.case import Case
-from abbe.models.discovery.discover import Progress, discover
+from abbe.models.discovery.discover import ShareSink, discover
 from abbe.models.discovery.finding import gaps_of
 from abbe.models.discovery.lack import Floor
 from abbe.models.discovery.solved_model import left_over, predictions, solve
@@ -32,7 +32,7 @@ class _Scatter:
     long: float
 
 
-def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: Progress | None = None) -> Discovery:
+def axis_discovery(case: Case, effects: tuple[Effect, ...], progress: ShareSink | None = None) -> Discovery:
     """Search a test of one axis for a drift of its repeats, then the readings without that drift for effects of the catalogue.
 
     The effects must exceed the scatter of the repeats, which is known without a noise model. If no effect does,
