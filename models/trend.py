@@ -295,6 +295,6 @@ class _Sums:
 
     def squares_if(self, reached: F1) -> F1:
         """Return, for each day, the smallest residual sum of squares over all knots if the limit is reached on that day."""
-        s = 1.0 / (reached[:, None] - self.knots[None, :])
-        level2 = (self.y - s * self.yr) ** 2 / (self.w - 2 * s * self.r + s**2 * self.rr)
-        return np.asarray((self.yy - level2).min(axis=1), dtype=np.float64)
+        away = reached - self.knots[:, None]
+        level2 = (self.y * away - self.yr[:, None]) ** 2 / ((self.w * away - 2 * self.r[:, None]) * away + self.rr[:, None])
+        return np.asarray(self.yy - level2.max(axis=0), dtype=np.float64)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import fcntl
+import hashlib
 import os
 import pickle
 import re
 import shutil
 import sqlite3
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -36,6 +38,47 @@ def once_per_run(factory: pytest.TempPathFactory, name: str, make: Callable[[Pat
             kept.write_bytes(made)
     found: T = pickle.loads(kept.read_bytes())
     return folder, found
+
+
+@pytest.fixture(scope="module")
+def solved_once() -> Iterator[None]:
+    """For a file that asks for it: what equal readings of an equal machine tell is computed once, because it is a function of them."""
+    from abbe.service.identification import removal, solve, solve_report
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(solve, "settled_points", _remembered(solve.settled_points))
+        joint = _remembered(solve.solve_joint)
+        for module in (solve, removal):
+            patch.setattr(module, "solve_joint", joint)
+        patch.setattr(solve_report, "assess", _assessed_once(solve_report))
+        yield
+
+
+def _assessed_once(module: Any) -> Callable[..., Any]:
+    assess, known = module.assess, dict[tuple[Any, ...], Any]()
+
+    def look_up(solved: Any, *, unknown_table: bool = False) -> Any:
+        if unknown_table:
+            return assess(solved, unknown_table=True)
+        joint, values = solved.joint, (repr(solved.removed), repr(solved.tables), repr(solved.inputs))
+        key = (repr(joint.machine), module.model_key(joint), joint.coefficients.tobytes(), *values, *sorted(solved.digests.items()))
+        if key not in known:
+            known[key] = assess(solved)
+        return replace(known[key], solved=solved)
+
+    return look_up
+
+
+def _remembered(compute: Callable[..., T]) -> Callable[..., T]:
+    known: dict[bytes, T] = {}
+
+    def look_up(*given: Any, progress: Any = None, **named: Any) -> T:
+        key = hashlib.sha256(pickle.dumps((given, sorted(named.items())))).digest()
+        if key not in known:
+            known[key] = compute(*given, **named, **({"progress": progress} if progress else {}))
+        return known[key]
+
+    return look_up
 
 
 @pytest.fixture(scope="session", autouse=True)

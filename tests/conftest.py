@@ -24,7 +24,7 @@ from typing import Any
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.built_once import _commands_built_once, _schema_built_once  # noqa: F401 - fixtures of every test
+from tests.built_once import _commands_built_once, _schema_built_once, solved_once  # noqa: F401 - fixtures of every test
 
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 settings.register_profile(  # how fast an example is drawn or passes says something of the computer, nothing of the product

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -20,12 +21,12 @@ from abbe.models.machine import AXES as DIRECTIONS
 __all__ = ["DIRECTIONS", "ROTATIONS", "Term", "layout_of", "legendre_values", "motion_names", "smooth_terms", "term_motions", "term_values"]
 
 
-@dataclass(frozen=True, slots=True)
-class Term:
+class Term(NamedTuple):
     """One term of the model: the part of an error motion with one Legendre order; its coefficient is an unknown of a solution.
 
     ``motion``: e.g. ``"EYX"``, with ``order`` 1 or more; squareness is ``"C0Y"``, ``"B0Z"``, ``"A0Z"`` with order 0. ``axis``: index of the
-    moving axis. ``component``: 0..2 for the translations X, Y, Z, 3..5 for the rotations A, B, C.
+    moving axis. ``component``: 0..2 for the translations X, Y, Z, 3..5 for the rotations A, B, C. A named tuple, because hundreds of terms
+    are the key of what is kept for them (`layout_of`).
     """
 
     motion: str

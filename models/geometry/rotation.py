@@ -5,6 +5,7 @@ Three forms make a rotation from E = (EA, EB, EC) (docs/explanation/conventions.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import factorial
 from typing import Literal
 
@@ -110,6 +111,12 @@ def turn_zyx(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:
         added[..., u] -= c1 * a + s * b
         added[..., w] += s * a - c1 * b
     return added
+
+
+def matrix_zyx(angles_deg: Sequence[float]) -> F2:
+    """Return R = Rz Ry Rx of turns about x, then y, then z by three angles in degrees; 12 digits, so quarter turns are exact."""
+    turned: F2 = np.eye(3) + turn_zyx(np.deg2rad(angles_deg)[None], np.eye(3))
+    return np.round(turned.T, 12) + 0.0
 
 
 def turn_small(rotation_rad: F2, v_mm: F2, *, reverse: bool = False) -> F2:

@@ -153,24 +153,29 @@ def uncertainty_mm(information: F2, rows: F2, stated_mm2: F1 | float = 0.0) -> t
     return float(np.sqrt(v.max())), float(np.sqrt(v.mean()))
 
 
-def pose_uncertainty_mm(
-    what: PlanningProblem, runs: tuple[RunData, ...], points_mm: F2, noise_mm: float, n_axes: int
-) -> tuple[float, float]:
-    """Return the standard uncertainty of the deviation at points: at the worst point, and rms, mm.
+def pose_fields(what: PlanningProblem, points_mm: F2, n_axes: int) -> F2:
+    """Deviation at points per unit of ``root``, the best-fit rigid motion removed, shape (n_axes * points, size), mm.
 
-    The best-fit rigid motion is removed. ``n_axes``: 2, X and Y at points in a plane; 3, all axes. ``runs``: poses, and calibrated lengths
-    of the artefact; ``noise_mm``: per reading.
+    ``n_axes``: 2, X and Y at points in a plane; 3, all axes.
+    """
+    fields = design(what.machine, what.terms, points_mm)[:, :n_axes].reshape(n_axes * len(points_mm), -1)
+    return np.asarray(_without_motion(points_mm, fields, n_axes) @ what.root[: len(what.terms)])
+
+
+def pose_uncertainty_mm(what: PlanningProblem, runs: tuple[RunData, ...], fields: F2, noise_mm: float, n_axes: int) -> tuple[float, float]:
+    """Return the standard uncertainty of the deviation at the points of ``fields`` (`pose_fields`): at the worst point, and rms, mm.
+
+    ``runs``: poses, and calibrated lengths of the artefact; ``noise_mm``: per reading.
     """
     n_terms = len(what.terms)
     setup = setup_unknowns(runs, what.priors, what.machine)
     full = np.concatenate([run_design(what.machine, what.terms, r, setup) * np.sqrt(r.weight_n)[:, None] for r in runs]) / noise_mm
     shared = full[:, : n_terms + LOST] @ what.root[: n_terms + LOST]
     a = np.concatenate([shared, full[:, n_terms + LOST :] * setup.prior_sd], axis=1)
-    fields = design(what.machine, what.terms, points_mm)[:, :n_axes].reshape(n_axes * len(points_mm), -1)
-    rows = _without_motion(points_mm, fields, n_axes) @ what.root[:n_terms]
-    whole = np.concatenate([rows, np.zeros((len(rows), a.shape[1] - rows.shape[1]))], axis=1)
-    factor = scipy.linalg.cho_factor(a.T @ a + np.eye(a.shape[1]))
-    variance = np.einsum("ij,ji->i", whole, scipy.linalg.cho_solve(factor, whole.T)).reshape(-1, n_axes).sum(axis=1)
+    low = scipy.linalg.cholesky(a.T @ a + np.eye(a.shape[1]), lower=True)
+    whole = np.concatenate([fields.T, np.zeros((a.shape[1] - fields.shape[1], len(fields)))])
+    half = scipy.linalg.solve_triangular(low, whole, lower=True)
+    variance = (half**2).sum(axis=0).reshape(-1, n_axes).sum(axis=1)
     return float(np.sqrt(variance.max())), float(np.sqrt(variance.mean()))
 
 

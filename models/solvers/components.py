@@ -11,6 +11,7 @@ prior of the error motions (`cautious`). The result is deterministic.
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property
 
@@ -178,8 +179,11 @@ class ComponentPosterior:
 
 def blend(sums: InformationSums, c: Components, half: F1) -> tuple[F2, F1, float]:
     """Information, moment and sum of squares over all instruments in units of the prior: (p, p), (p,), scalar."""
-    w = np.exp(-c.eta)
-    gram = sum((w[k] * sums.gram[k] for k in np.flatnonzero(sums.count > 0)), np.zeros_like(sums.gram[0])) * (half[:, None] * half)
+    w, gram = np.exp(-c.eta), np.zeros_like(sums.gram[0])
+    for k in np.flatnonzero(sums.count > 0):  # in place: these products are a fifth of all the work
+        gram += w[k] * sums.gram[k]
+    gram *= half[:, None]
+    gram *= half
     return gram, (w @ sums.rhs) * half, float(w @ sums.square)
 
 
@@ -285,8 +289,11 @@ def _bounds(c: Components, model: SizeModel) -> tuple[F1, F1]:
 
 def _positive(info: F2, least: float) -> F2:
     """Raise eigenvalues to at least ``least``; smaller ones come only from rounding (readings without noise)."""
+    with suppress(np.linalg.LinAlgError):  # nearly always; it takes a twentieth of the time of the eigenvalues
+        scipy.linalg.cholesky(info - least * np.eye(len(info)), check_finite=False)
+        return info
     values, vectors = scipy.linalg.eigh(info)
-    return info if values[0] >= least else np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
+    return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)
 
 
 def _moved(c: Components, step: F1, model: SizeModel) -> Components:

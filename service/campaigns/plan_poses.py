@@ -16,7 +16,7 @@ import numpy as np
 
 from abbe.models.arrays import F2
 from abbe.models.planning.measurements import Instruments
-from abbe.models.planning.problem import PlanningProblem, pose_uncertainty_mm, problem
+from abbe.models.planning.problem import PlanningProblem, pose_fields, pose_uncertainty_mm, problem
 from abbe.models.solvers.engine import DEFAULT_SIGMA_MM
 from abbe.models.solvers.observability.poses import SHIFT, PoseRank, pose_rank
 from abbe.models.solvers.observations import RunData
@@ -94,13 +94,14 @@ def plan_poses(site: Site, name: str, plate: ArtefactObject, minutes: float, pro
     what = problem(site.machine, Instruments(), ORDER)
     points = _points([plan for _, plan, _ in offered], LEVELS if _may_tilt(plate) else 1)
     n_axes = 3 if np.ptp(points[:, 2]) else 2
+    fields = pose_fields(what, points, n_axes)
     chosen, runs, used = list[PlannedPose](), list[Run](), 0.0
     while True:
         progress(Progress("plan", used, minutes, None, f"pose {len(chosen) + 1}"))
         rest = [(r, plan, dry) for r, plan, dry in offered if used + MOUNT_MIN + dry.duration_s / 60.0 <= minutes]
         if not rest:
             break
-        tried = [(*_known(what, (*runs, _expected(site, plan)), points, n_axes), r, plan, dry) for r, plan, dry in rest]
+        tried = [(*_known(what, (*runs, _expected(site, plan)), fields, n_axes), r, plan, dry) for r, plan, dry in rest]
         rank, worst, mean, recipe, _, dry = min(tried, key=lambda one: (0 if n_axes == 3 or one[0] is None else -one[0].rank, one[2]))
         if chosen and mean > 0.98 * chosen[-1].u_mean_mm and (rank is None or chosen[-1].rank is None or rank.rank == chosen[-1].rank.rank):
             break
@@ -171,10 +172,10 @@ def _expected(site: Site, plan: TestPlan) -> Run:
     return run.with_artefact({"artefacts": plan.artefact})
 
 
-def _known(what: PlanningProblem, runs: tuple[Run, ...], points: F2, n_axes: int) -> tuple[PoseRank | None, float, float]:
+def _known(what: PlanningProblem, runs: tuple[Run, ...], fields: F2, n_axes: int) -> tuple[PoseRank | None, float, float]:
     named = [_data(f"p{k}", run) for k, run in enumerate(runs)]
     data = (*named, *calibrated_lengths(list(runs)))
-    return pose_rank(data), *pose_uncertainty_mm(what, data, points, DEFAULT_SIGMA_MM["artefact"], n_axes)
+    return pose_rank(data, cures=False), *pose_uncertainty_mm(what, data, fields, DEFAULT_SIGMA_MM["artefact"], n_axes)
 
 
 def _data(name: str, run: Run) -> RunData:

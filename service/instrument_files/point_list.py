@@ -13,9 +13,9 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
-import scipy
 
 from abbe.models.arrays import F2
+from abbe.models.geometry.rotation import matrix_zyx
 from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE
 from abbe.service.domain.document import Doc
 from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
@@ -166,8 +166,7 @@ def _vector(one: PointList, key: str, usual: str) -> list[float]:
 def _matrix(one: PointList) -> F2:
     turns = one.head.get("rotation_deg", "0").replace(",", " ").split()
     turns = ["0", "0", turns[0]] if len(turns) == 1 else turns
-    matrix: F2 = scipy.spatial.transform.Rotation.from_euler("xyz", [float(v) for v in turns], degrees=True).as_matrix()
-    return np.round(matrix, 12) + 0.0
+    return matrix_zyx([float(v) for v in turns])
 
 
 def _columns(one: PointList, start_s: float) -> Columns:

@@ -66,10 +66,25 @@ def world_of(protocol: SimpleNamespace, case: Case, plan: Plan) -> World:
     return OneBankWorld(protocol, case, plan) if case.level == 1 else World(protocol, case, plan)
 
 
+_KINDS: dict[tuple[str, Case, tuple[tuple[int, str], ...]], list[str]] = {}
+"""Kinds of all operations of the runs with one fault at most, by protocol, case and fault: every run of a plan is the same."""
+
+
 def run(protocol: SimpleNamespace, case: Case, plan: Plan, count: Count) -> World:
     world = world_of(protocol, case, plan)
     count.add(case, plan, world, [*world.run(), *_expected(case, plan, world)])
+    if len(plan) < 2:
+        _KINDS[_key(protocol, case, plan)] = world.kinds[: world.n_before_judging]
     return world
+
+
+def _key(protocol: SimpleNamespace, case: Case, plan: Plan) -> tuple[str, Case, tuple[tuple[int, str], ...]]:
+    return str(protocol.execute.__name__), case, tuple(plan.items())
+
+
+def _kinds(protocol: SimpleNamespace, case: Case, plan: Plan) -> list[str]:
+    """`World.kinds_of_run`, known from the sweep over single faults if it has gone before."""
+    return _KINDS.get(_key(protocol, case, plan)) or world_of(protocol, case, plan).kinds_of_run()
 
 
 def _expected(case: Case, plan: Plan, world: World) -> list[str]:
@@ -80,13 +95,15 @@ def _expected(case: Case, plan: Plan, world: World) -> list[str]:
     return ["END"] if harmless and (not world.journal or str(world.journal[-1].state) not in ends) else []
 
 
-def singles(protocol: SimpleNamespace, cases: tuple[Case, ...] = CASES) -> Count:
-    """No fault, and every single one."""
+def singles(protocol: SimpleNamespace, cases: tuple[Case, ...] = CASES, *, until: frozenset[str] = frozenset()) -> Count:
+    """No fault, and every single one; ``until`` all of these are violated, if any are given."""
     count = Count()
     for case in cases:
         kinds = run(protocol, case, {}, count).kinds
         for n, fault in faults_of(kinds, 0):
             run(protocol, case, {n: fault}, count)
+            if until and until <= count.violated.keys():
+                return count
     return count
 
 
@@ -103,11 +120,11 @@ def doubles(
     ``every`` k: each k-th pair. ``part`` (a, b): only first faults a, a + b, ... to share the work.
     """
     count, pair = Count(), 0
-    kinds = world_of(protocol, case, {}).kinds_of_run()
+    kinds = _kinds(protocol, case, {})
     for number, (n, fault) in enumerate(faults_of(kinds, 0)):
         if number % part[1] != part[0]:
             continue
-        seconds = world_of(protocol, case, {n: fault}).kinds_of_run()
+        seconds = _kinds(protocol, case, {n: fault})
         for m, second in faults_of(seconds, n + 1):
             pair += 1
             if pair % every == 0:

@@ -39,7 +39,7 @@ def bar_run_under_way(folder: Path, chunks: int = 1, name: str = "identify") -> 
 def test_the_machine_becomes_better_and_the_archive_is_loss_free(abbe, command, tmp_path):
     """On five machines: test_five_seeds.py, in the long run."""
     folder = tmp_path / "kept"
-    process = abbe("demo", "--seed", "2", "--speed", "60", "--json", "--keep", str(folder))
+    process = abbe("demo", "--seed", "2", "--speed", "120", "--json", "--keep", str(folder))
     for pid in wait_for(lambda: simulators_of(folder), 60, "the simulated machine"):
         hardware.first(pid)
     out, err = process.communicate(timeout=200)

@@ -3,7 +3,6 @@
 import json
 import re
 import tarfile
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -12,37 +11,19 @@ from abbe.models.geometry.volume import unit_deviation, volume_frame
 from abbe.service.campaign_data.campaign_folder import from_folder
 from abbe.service.domain.machine import machine_from_doc
 from abbe.service.domain.solution_file import SolutionFile, StoredPrediction
-from abbe.service.identification import solve_report
 from abbe.service.identification.solve import solve_runs
 from abbe.service.runs.exchange import import_folder
 from abbe.service.storage.store import Store
 from tests.experiments.campaigns.population import draw_case
 from tests.scenarios.campaign_files import measured, thinned, write_folder
 
-pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120)]
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(120), pytest.mark.usefixtures("solved_once")]
 SEED = 7
 
 
 @pytest.fixture(autouse=True)
 def own_database(monkeypatch):
     monkeypatch.delenv("ABBE_DB", raising=False)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def assessed_once():
-    """What a solution can tell takes longer than the solution; it is a function of machine, readings and model."""
-    assess, known = solve_report.assess, {}
-
-    def look_up(solved, **words):
-        values = (solved.joint.coefficients.tobytes(), repr(solved.removed), repr(solved.tables), repr(words))
-        key = (repr(solved.joint.machine), solve_report.model_key(solved.joint), *values, *sorted(solved.digests.items()))
-        if key not in known:
-            known[key] = assess(solved, **words)
-        return replace(known[key], solved=solved)
-
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(solve_report, "assess", look_up)
-        yield
 
 
 @pytest.fixture(scope="module")

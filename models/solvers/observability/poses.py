@@ -50,8 +50,11 @@ class PoseRank:
         return out + (f" A further pose would show more: {'; or '.join(said)}." if said else " A calibrated length would give the scale.")
 
 
-def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
-    """Analyse the poses of one artefact in a plane; None for a workpiece, several artefacts, walls, or poses that are tilted."""
+def pose_rank(runs: tuple[RunData, ...], *, cures: bool = True) -> PoseRank | None:
+    """Analyse the poses of one artefact in a plane; None for a workpiece, several artefacts, walls, or poses that are tilted.
+
+    ``cures``: try further poses, too, which takes five times as long.
+    """
     mine = [(r.axes_mm, r.points) for r in runs if r.points is not None and r.points.source == "probe"]
     if not mine or len({p.artefact for _, p in mine}) > 1 or any(p.normal.any() for _, p in mine):
         return None
@@ -62,13 +65,13 @@ def pose_rank(runs: tuple[RunData, ...]) -> PoseRank | None:
     free = not any(r.points is not None and r.points.source == "length" for r in runs)
     poses = [_flat(axes, p, keep) for axes, p in mine]
     rank, hidden = _rank_and_hidden(poses, scale=free)
-    cures = []
-    for name, pose in _candidates(poses):
+    found = []
+    for name, pose in _candidates(poses) if cures else ():
         better, left = _rank_and_hidden([*poses, pose], scale=free)
         if better > rank:
-            cures.append((name, better, tuple(h for h in hidden if h not in left)))
-    cures.sort(key=lambda one: -one[1])
-    return PoseRank("XYZ"[keep[0]] + "XYZ"[keep[1]], rank, 27, hidden, tuple(cures))
+            found.append((name, better, tuple(h for h in hidden if h not in left)))
+    found.sort(key=lambda one: -one[1])
+    return PoseRank("XYZ"[keep[0]] + "XYZ"[keep[1]], rank, 27, hidden, tuple(found))
 
 
 def are_tilted(runs: tuple[RunData, ...]) -> bool:

@@ -14,6 +14,7 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import Field as Limits
 
+from abbe.models.geometry.rotation import matrix_zyx
 from abbe.models.machine import Machine
 from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE, ArtefactObject, Feature, QualificationSphere
 from abbe.service.domain.document import Doc
@@ -65,11 +66,7 @@ class ArtefactTest(TestRecipe):
 
     def matrix(self) -> Array:
         """Columns: the artefact's axes in machine axes."""
-        from scipy.spatial.transform import Rotation
-
-        turn = Rotation.from_euler("xyz", self.rotation_deg, degrees=True)
-        found: Array = np.round(turn.as_matrix(), 12) + 0.0
-        return found
+        return matrix_zyx(self.rotation_deg)
 
     def plan(self, machine: Machine) -> TestPlan:
         """Return the test with its steps: up, mount, touch every feature and the first one again and again, clear away.

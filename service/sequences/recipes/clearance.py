@@ -134,8 +134,8 @@ def check_clear(
     ConfigError
         A part comes nearer; feature and body are named.
     """
-    here = start_mm
-    for one in touches:
+    here, solids = start_mm, tuple(some for some in solids if some.names)
+    for one in touches if solids else ():
         places, up = np.concatenate([_along(way) for way in _ways(here, one)]), np.array(one.up)
         here = one.above_mm
         for part in parts:
@@ -143,7 +143,7 @@ def check_clear(
                 gaps = some.gaps_mm(places, up, part)
                 meant = np.array([isinstance(some, Balls) and part.from_mm == 0.0 and n == one.feature for n in some.names], dtype=bool)
                 gaps = np.where(meant, np.inf, gaps)
-                if gaps.size and gaps.min() < margin_mm:
+                if gaps.min() < margin_mm:
                     raise ConfigError(
                         f"artefact {artefact}, feature {one.feature}: {part.name} comes within {gaps.min():.1f} mm of "
                         f"{some.names[int(np.argmin(gaps))]} on the way there",

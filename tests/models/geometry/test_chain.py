@@ -6,6 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from abbe.models.geometry.bases import smooth_terms
 from abbe.models.geometry.chain import all_chains, design, deviation_mm, exact_deviation_mm, travel_sign
+from abbe.models.geometry.rotation import matrix_zyx
 from abbe.models.geometry.volume import volume_grid
 from abbe.models.machine import AXES, Machine, levers_mm, split_chain
 from abbe.models.solvers.least_squares import analyse
@@ -157,3 +158,9 @@ def test_presets_are_chains_found_by_name_and_say_what_carries_what():
     ]  # fmt: skip
     with pytest.raises(ValueError, match="expected one of MB1"):
         preset("MB3")
+
+
+def test_turns_about_x_then_y_then_z_are_those_of_a_text_book_and_quarter_turns_are_exact():
+    for turns in np.random.default_rng(1).uniform(-360.0, 360.0, (20, 3)):
+        assert matrix_zyx(turns) == pytest.approx(Rotation.from_euler("xyz", turns, degrees=True).as_matrix(), abs=1e-12)
+    assert matrix_zyx((0.0, 0.0, 90.0)).tolist() == [[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]

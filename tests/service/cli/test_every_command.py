@@ -22,7 +22,7 @@ from abbe.service.cli.app import app
 from tests.conftest import ROOT as REPOSITORY
 from tests.service.cli.every_command import CASES, Case, filled_folder
 
-pytestmark = pytest.mark.timeout(300)
+pytestmark = [pytest.mark.timeout(300), pytest.mark.usefixtures("solved_once")]
 ROOT: Any = typer.main.get_command(app)
 HERE = [name for name, case in CASES.items() if not case.proof]
 

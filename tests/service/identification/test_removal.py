@@ -40,6 +40,7 @@ from abbe.service.tables.nine_tables import Base, table_image
 from tests.run_documents import run_of
 from tests.service.discovery.discovery_bench import WIDTH_MM, write_case
 
+pytestmark = pytest.mark.usefixtures("solved_once")
 DB = "sqlite:///book.sqlite3"
 LOST = np.array([6e-3, 4e-3, 0.0])
 BEAM = np.ones(3) / np.sqrt(3.0)
