@@ -44,7 +44,7 @@ class World:
         self.table = PlateUnderProbe(scenario, geometry.tool_mm)
         self.controller.feel = self._felt
         self.controller.probe_fitted = lambda: self.table.fitted
-        self.controller.deflected = lambda: self.table.fitted and self.table.deflected(self.tool_position(), self.time_s)
+        self.controller.deflected = self._deflected
         self._play = Play(self.draws.backlash_mm, self.controller.position_mm)
         self._laser_tick = 0
         self.laser.record(0, 0.0, self._play.position_mm)
@@ -94,6 +94,11 @@ class World:
         """Make the air warmer by ``plus_c`` K from now on; earlier samples do not change."""
         self.laser.output()
         self.air.warmer_c += plus_c
+
+    def _deflected(self) -> bool:
+        """Whether the probe's stylus is pushed aside now. Far from the plate it is not, wherever the machine's errors put it."""
+        near = self.table.fitted and self.table.near(self.controller.position_mm + self.machine.geometry.tool_mm, self.time_s)
+        return near and self.table.deflected(self.tool_position(), self.time_s)
 
     def _felt(self, start_mm: F, target_mm: F, feed_mm_min: float) -> Felt:
         """Return the contacts of the probe on a straight move from now on, without changing the present state of the lost motion."""

@@ -50,6 +50,8 @@ def draw_stylus(config: ProbeConfig, seed: int) -> Stylus:
 
 
 COARSE_MM, FINE_MM = 0.25, 0.01
+NEAR_MM = 2.0
+"""More than the errors of any simulated machine."""
 CRASH_MM = 1.0
 """Depth in the material beyond which the stylus breaks."""
 OVERTRAVEL_S = 0.002
@@ -100,6 +102,10 @@ class PlateUnderProbe:
     def deflected(self, tip_mm: F, time_s: float) -> bool:
         """Whether the stylus is pushed aside at a place of its tip (3,)."""
         return bool(self.fitted and self._free(tip_mm[None, :], time_s)[0] < -0.5 * self.stylus.pretravel_mm)
+
+    def near(self, tip_mm: F, time_s: float) -> bool:
+        """Whether the stylus may touch something if its tip is within `NEAR_MM` of a place (3,)."""
+        return bool(self._free(tip_mm[None, :], time_s)[0] < NEAR_MM)
 
     def contact(self, length_mm: float, way: F, tip: Tip, time_s: float) -> float | None:
         """Return the length of a straight move, mm, after which the probe trips; None if never. ``way``: unit vector of the move."""

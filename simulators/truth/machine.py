@@ -33,8 +33,12 @@ class Machine:
 
     def motions(self, axis: int, position_mm: F) -> tuple[F, F]:
         """Return translational (mm, with squareness) and angular (rad) error of one carriage at n positions: two arrays (n, 3)."""
-        new = np.diff(position_mm, prepend=np.nan) != 0.0  # evaluate repeated positions of a resting axis once
-        values = self.draws.motions[axis](position_mm[new])[np.cumsum(new) - 1]
+        function = self.draws.motions[axis]
+        if position_mm.size == 1:
+            values = function(position_mm)
+        else:
+            new = np.diff(position_mm, prepend=np.nan) != 0.0  # evaluate repeated positions of a resting axis once
+            values = function(position_mm[new])[np.cumsum(new) - 1]
         shift = values[:, :3].copy()
         shift[:, axis] += self.extra_scale[axis] * (position_mm - self.geometry.low_mm[axis])
         c0y, b0z, a0z = self.draws.squareness

@@ -39,7 +39,7 @@ def copy_identified(factory: pytest.TempPathFactory, folder: Path) -> None:
 
 
 def _identify(folder: Path) -> None:
-    with simulated(folder, *MACHINE, "--speed", "80") as sims:
+    with simulated(folder, *MACHINE, "--speed", "160") as sims:
         loaded = load_machine(sims.machine_file)
         with Store.open(loaded.database_url) as store:
             asyncio.run(_measure(site_of(loaded.machine), store))

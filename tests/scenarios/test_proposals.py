@@ -38,7 +38,7 @@ from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
 from tests.scenarios.world import registers
 
-pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240)]
+pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240), pytest.mark.usefixtures("solved_once")]
 TWO = "[material]\ntemperature_c = 21.5\n[limits]\ntwo_people = true\n"
 
 
@@ -74,7 +74,7 @@ class Shop:
 def shop(tmp_path_factory: pytest.TempPathFactory) -> Any:
     folder = tmp_path_factory.mktemp("proposals")
     copy_identified(tmp_path_factory, folder)
-    with simulated(folder, *MACHINE, "--speed", "80", extra=TWO) as sims:
+    with simulated(folder, *MACHINE, "--speed", "160", extra=TWO) as sims:
         loaded = load_machine(sims.machine_file)
         site = site_of(loaded.machine)
         before = controller_words(sims)
@@ -237,7 +237,7 @@ def test_a_changed_row_is_found_also_where_its_digest_was_made_anew(shop, capsys
 
 
 def test_a_restarted_control_with_the_same_table_and_generation_is_refused(shop, tmp_path):
-    with simulated(tmp_path, *MACHINE, "--boot-id", "0", "--speed", "80") as restarted, Store.open(shop.url) as store:
+    with simulated(tmp_path, *MACHINE, "--boot-id", "0", "--speed", "160") as restarted, Store.open(shop.url) as store:
         number = shop.copy(store)
         approve(store, number, "anna", 24.0, SystemClock())
         before = controller_words(restarted)

@@ -22,7 +22,7 @@ SECTION = (ROOT / "README.md").read_text(encoding="utf-8").split("## On your mac
 LINES = [line.partition("#")[0].strip() for line in re.findall(r"^    (abbe .*)$", SECTION, re.MULTILINE)]
 INIT, SIM, *WORKS, SERVE = LINES
 """Lines of README: for a machine of one's own, for the simulated one, the work on either, and the service, which does not end."""
-FASTER = {"--speed 20": f"--speed {os.environ.get('ABBE_README_SPEED', '40')}"}
+FASTER = {"--speed 20": f"--speed {os.environ.get('ABBE_README_SPEED', '80')}"}
 SHORT = 3
 """Number of lines that are typed in every run of the tests; all of them take minutes and belong to the long run."""
 

@@ -24,7 +24,7 @@ def fleet(url, capsys):
 
 
 def test_a_rollback_asks_and_the_machine_is_unverified_until_it_is_measured(start_sims, tmp_path, capsys):
-    sims = start_sims("--speed", "40")
+    sims = start_sims("--speed", "80")
     url, file = f"sqlite:///{sims.machine_file.parent / 'abbe.sqlite3'}", str(sims.machine_file)
 
     async def kept():

@@ -73,7 +73,7 @@ BASE = {"scale": 60e-5, "shear": -20e-5}
 @contextmanager
 def made_shop(folder: Path) -> Iterator[Shop]:
     """The machine, its table in force and its verification with it, measured."""
-    with simulated(folder, "--speed", "60", "--seed", "5") as sims:
+    with simulated(folder, "--speed", "120", "--seed", "5") as sims:
         made = Shop(sims, site_of(sims), f"sqlite:///{folder / 'abbe.sqlite3'}")
         asyncio.run(_prepared(made))
         yield made

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import os
 import threading
 import time
 from collections.abc import Iterator
@@ -23,6 +24,7 @@ from tests.system.test_serve_processes import PHRASE, Running, tokens, url_of
 from tests.system.test_serve_screens import context
 
 pytestmark = pytest.mark.timeout(300)
+LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 LABORATORY = {
     "issuer.laboratory": "Länglab GmbH",
     "issuer.city": "Ulm",
@@ -146,7 +148,7 @@ def test_what_may_not_be_is_refused_and_the_file_stays(desk: Desk) -> None:
 
 
 @pytest.mark.browser
-@pytest.mark.parametrize("size", ["1280", "390"])
+@pytest.mark.parametrize("size", ["1280", "390"] if LONG else ["390"])
 def test_a_laboratory_is_entered_by_touches_and_the_browser_waits_for_the_service(chromium: Browser, desk: Desk, size: str) -> None:
     base = str(desk.running.http.base_url).rstrip("/")
     with context(chromium, size) as made:

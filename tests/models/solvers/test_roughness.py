@@ -73,9 +73,9 @@ def test_no_period_is_claimed_where_there_is_none(smooth, rough):
     assert periods(rough[1]) == ()
 
 
-def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_than_no_map(smooth, rough):
+def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_than_no_map(smooth, rough, solved_truth):
     truth, found = rough
-    for one in (smooth, solve_joint(MACHINE, Truth(7).campaign())):
+    for one in (smooth, solved_truth(2)[1]):
         assert max(t.order for t in one.terms) == SMOOTH_ORDER
         assert rough_lines(one) == ()
     assert max(t.order for t in found.terms) > SMOOTH_ORDER
@@ -86,7 +86,7 @@ def test_only_a_rough_machine_is_solved_for_rough_parts_and_its_map_is_better_th
     assert np.std(left[1]) < 0.8 * np.std(left[0])
 
 
-@pytest.mark.parametrize("seed", range(500) if LONG else [0, 1, 2, 3, 4, 401])
+@pytest.mark.parametrize("seed", range(500) if LONG else [1, 2, 401])
 def test_poor_campaigns_never_make_a_machine_less_known_than_its_prior_or_a_map_larger_than_it_and_the_readings(seed):
     """Three runs, one corner, one diagonal, whatever is left of a campaign: nothing explodes outside of what was measured.
 

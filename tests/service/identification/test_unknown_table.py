@@ -1,5 +1,6 @@
 """A table that acted and that nobody has: how large its effect on the readings is assumed to be, and what it does to the uncertainty."""
 
+import os
 from dataclasses import replace
 
 import numpy as np
@@ -17,7 +18,7 @@ from tests.experiments.campaigns.population import draw_case
 ORDER = 6
 
 
-@pytest.mark.parametrize("seed", [1, 6])
+@pytest.mark.parametrize("seed", [1, 6] if os.environ.get("ABBE_TEST_LONG") == "1" else [1])
 def test_a_real_table_is_of_the_size_that_is_drawn_and_the_uncertainty_includes_it(seed: int) -> None:
     """The machine is corrected by its own table and measured again; its lost motion absorbs a part of what the table moves."""
     case = draw_case(seed, "joint")
