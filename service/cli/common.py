@@ -158,22 +158,15 @@ def warn_of_readers(url: str) -> None:
 
 
 def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
-    """Return the run of this name, else the campaign.
+    """Return the campaign of this name, else the run. A run with the label of a campaign is CAMPAIGN/RUN, or its number.
 
     Raises
     ------
     StoreError
-        Neither is in the database.
+        Neither is in the database, or several runs have this label.
     """
-    from abbe.service.errors import StoreError
-
-    try:
-        return store.runs.find(name)
-    except StoreError:
-        found = next((one for one in store.campaigns.all() if one.name == name), None)
-        if found is None:
-            raise
-        return found
+    found = next((one for one in store.campaigns.all() if one.name == name), None)
+    return store.runs.find(name) if found is None else found
 
 
 def check_endings(*targets: Path | None) -> None:

@@ -250,6 +250,7 @@ def correct(
     from abbe.service.cli.running import rollback_when_safe, run_job
     from abbe.service.compensation.correct import correct as work_correct
     from abbe.service.compensation.gate import PushContext, check_preconditions
+    from abbe.service.compensation.proposals import gather
     from abbe.service.errors import TakenBack
     from abbe.service.storage.store import Store
 
@@ -265,6 +266,7 @@ def correct(
             async with ready_session(store, site, accept_table=accept_table) as session:
                 context = PushContext(session, store, site, sink, poses=poses)
                 control = await check_preconditions(context)
+                await gather(session.controller, store, site, campaign)  # a campaign that is refused is refused before anything moves
                 hints.append(control.hint)
                 runs = await verification_before(context, before)
                 async with rollback_when_safe(session, store, site, wait_s):

@@ -82,6 +82,8 @@ class PushPrecheck:
         if drift_mm is not None and candidate.digest == content_digest(candidate):
             candidate = _drifted(candidate, drift_mm)
         found = [*self._bound(), *self._rejected(), *reasons_against(candidate, self.context, self.site.limits), *self._approved()]
+        if same := [reason for reason in found if reason.startswith("SAME: ")]:
+            return same  # whatever else has changed since came with this push
         if self.proposed.reasons and not found:
             found = [f"PROPOSED: {len(self.proposed.reasons)} reasons were against the table and no longer hold: propose again"]
         return found
@@ -152,7 +154,7 @@ def _changed(then: dict[str, Any], now: dict[str, Any]) -> str:
 
 
 def _formatted(value: object) -> str:
-    return " to ".join(f"{v:g}" for v in value) if isinstance(value, tuple | list) else f"{value:g}"
+    return " to ".join(f"{v:g}" for v in value) if isinstance(value, tuple | list) else "none" if value is None else f"{value:g}"
 
 
 @dataclass(frozen=True, slots=True)

@@ -411,7 +411,8 @@ def _whole(c: Candidate, context: CandidateContext, limits: PushLimits) -> Itera
     """Predict the residuals with the new table from the residuals measured with the table in force."""
     values = [x for column in c.columns for x in column.correction_mm]
     active = [x for column in c.columns for x in _active(column, context)]
-    if values == active:
+    none_mm = WHOLE * 1e-6 * c.lsb_nm
+    if len(values) == len(active) and all(abs(new - old) <= none_mm for new, old in zip(values, active, strict=True)):
         yield "SAME: this table is in force already"
         return
     if not any(values) and any(active):

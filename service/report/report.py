@@ -302,7 +302,11 @@ def numbered_report(store: Store, what: str, number: int, rules: Rules, machine:
         return discovery_report(store, number, rules)
     if what == "verification":
         return verification_report(store, number, rules)
-    names = list(dict.fromkeys(m.name for m in store.machines.all())) if machine is None else [machine]
+    names = list(dict.fromkeys(m.name for m in store.machines.all()))
+    if machine is not None:
+        if machine not in names:
+            raise NotStored(f"no machine {machine!r} in the database", f"known are {', '.join(names) or 'none'}")
+        names = [machine]
     chains = {store.pushes.chain(n): n for n in names}  # machines that were renamed share one
     having = [n for chain, n in chains.items() if any(e.push == number for e in store.pushes.entries_of(chain))]
     if len(having) != 1:

@@ -141,7 +141,8 @@ def _all_zero(rng: Random) -> Made:
 
 def _the_same(rng: Random) -> Made:
     candidate, context = good(rng)
-    return candidate, replace(context, active={(c.moved, c.corrected): c.correction_mm for c in candidate.columns})
+    decoded = {(c.moved, c.corrected): tuple(v + rng.uniform(-1e-12, 1e-12) for v in c.correction_mm) for c in candidate.columns}
+    return candidate, replace(context, active=decoded)
 
 
 def _changed_machine(rng: Random) -> Made:

@@ -36,7 +36,7 @@ from abbe.service.storage.store import Store
 from abbe.service.tables.push_journal import JournalView
 from tests.scenarios.conftest import Sims, simulated
 from tests.scenarios.identified import MACHINE, copy_identified
-from tests.scenarios.world import registers
+from tests.scenarios.world import position_and_counters, registers
 
 pytestmark = [pytest.mark.scenario, pytest.mark.timeout(240), pytest.mark.usefixtures("solved_once")]
 TWO = "[material]\ntemperature_c = 21.5\n[limits]\ntwo_people = true\n"
@@ -322,8 +322,12 @@ def test_one_goes_all_the_way_and_back(shop, capsys, tmp_path: Path):
     pushed = shop.words()
     code, out = abbe("push", "-m", shop.file, str(twin), "--before", "start")
     assert code == 1
-    assert "not pushed: BASE" in out
+    assert "not pushed: SAME" in out, "whatever else has changed came with that push"
     assert shop.words() == pushed
+    stood = position_and_counters(shop.sims)
+    assert run(["correct", "-m", shop.file, "june"]) == 2
+    assert "was measured with table" in capsys.readouterr().err
+    assert position_and_counters(shop.sims) == stood, "known before anything moves"
 
     assert abbe("rollback", "-m", shop.file, "--yes")[0] == 0
     assert active_crc(shop.sims) == base_crc(base)

@@ -280,6 +280,7 @@ def test_a_journal_that_somebody_changed_is_told_on_the_report(stored, tmp_path)
         (("nothing-of-that-name",), "STO-002"),
         (("push",), "which push?"),
         (("push", "77"), "no push 77"),
+        (("push", "1", "--of", "atlantis"), "no machine 'atlantis'"),
         (("discovery", "77"), "no discovery 77"),
         (("verification", "77"), "no verification 77"),
         (("small", "3"), "give one name"),

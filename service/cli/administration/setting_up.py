@@ -159,8 +159,13 @@ def doctor(machine: MachineOption = None, as_json: JsonOption = False) -> None:
         print_json({"machine": loaded.machine.name, "ready": not bad, "examined": [asdict(one) for one in found]})
     else:
         print_table(("what", "", "found", "what to do"), [(one.what, one.state, one.text, one.remedy) for one in found])
-        word = "is not ready" if bad else "is ready"
-        then = "abbe doctor" if bad else "abbe measure --recipe quick-check"
+        devices = loaded.machine.devices
+        if bad:
+            word, then = "is not ready", "abbe doctor"
+        elif devices.cnc is not None:
+            word, then = "is ready", "abbe measure --recipe quick-check"
+        else:
+            word, then = "has no controller in its file, so that Abbe only listens, imports and solves", "abbe import FILE"
         verdict = f"{loaded.machine.name} {word}: {len(found)} points examined, {bad} bad, {look} to look at"
         conclude(then, machine=machine, verdict=verdict)
     raise typer.Exit(1 if bad else 0)

@@ -139,6 +139,14 @@ def test_no_command_prints_the_help(abbe: Abbe) -> None:
     assert "check-config" in result.err + result.out
 
 
+def test_a_name_of_a_campaign_and_of_a_run_is_the_campaign(abbe: Abbe, campaign_folder: Path) -> None:
+    for file in campaign_folder.glob("*.json"):
+        file.write_text(file.read_text().replace('"c1"', '"r01"'))
+    abbe("import", campaign_folder)
+    assert json.loads(abbe("show", "r01", "--json").out)["name"] == "r01"
+    assert json.loads(abbe("show", "r01/r01", "--json").out)["run_id"] == "r01"
+
+
 def test_import_list_show_export(abbe: Abbe, campaign_folder: Path, tmp_path: Path) -> None:
     assert abbe("import", campaign_folder).out == "imported campaign 'c1' with 3 runs into sqlite:///abbe.sqlite3\n"
     assert "is in the database already" in abbe.fails("import", campaign_folder)
@@ -149,6 +157,7 @@ def test_import_list_show_export(abbe: Abbe, campaign_folder: Path, tmp_path: Pa
     assert "setup.radius_mm" in shown
     assert "sealed" in shown
     assert json.loads(abbe("show", "c1/r01", "--json").out) == json.loads((campaign_folder / "r01-x.json").read_text())
+    assert json.loads(abbe("show", "c1", "--json").out)["name"] == "c1"
     assert abbe("export", "c1", tmp_path / "out").out.startswith("exported campaign 'c1' with 3 runs")
     assert "nothing was written" in abbe.fails("export", "c1", tmp_path / "out")
     assert json.loads((tmp_path / "out" / "campaign.json").read_text()) == json.loads((campaign_folder / "campaign.json").read_text())

@@ -134,6 +134,15 @@ def test_the_doctor_says_what_to_do_about_a_device_that_is_not_there(folder: Pat
     assert said.err.splitlines()[-1] == "next: abbe doctor"
 
 
+def test_without_a_controller_the_doctor_promises_no_measurement(folder: Path, capsys) -> None:
+    assert run(["init", *ANSWERS]) == 0
+    capsys.readouterr()
+    assert run(["doctor"]) == 0
+    err = capsys.readouterr().err
+    assert "mill-7 has no controller in its file, so that Abbe only listens, imports and solves" in err
+    assert err.splitlines()[-1] == "next: abbe import FILE"
+
+
 def test_what_this_computer_lacks_is_said(folder: Path, capsys, monkeypatch) -> None:
     """A certificate of the page that ended, a clock behind the newest record, a disk without room."""
     issued(folder, "page", None, days=(-30, -1))
