@@ -58,9 +58,11 @@ def _verdict_of(finding: Finding) -> tuple[str, str, str]:
     word = "Found"
     if judged.proved is None and entering(finding):
         word = "Found, not proved"
+    elif finding.beside:
+        word = "Found, but a part has no name"
     if finding.confounded_with:
         word = "Found, but these runs cannot tell it from something else"
-    left = _remainder_text(finding)
+    left = _beside_text(finding) + _remainder_text(finding)
     sign = "ok" if word == "Found" and not left else "open"
     return sign, word, f"{names}. {_capital(gap)}; {proof}.{left}"
 
@@ -78,6 +80,14 @@ def _nothing_missing_verdict(finding: Finding, gap: str) -> tuple[str, str, str]
 
 def _capital(text: str) -> str:
     return f"{text[:1].upper()}{text[1:]}"
+
+
+def _beside_text(finding: Finding) -> str:
+    """Warn that a name beside a structure without a name may belong to it; empty without such a structure."""
+    if not finding.beside:
+        return ""
+    label = finding.beside[0].label.replace("_", " ")
+    return f" The catalogue has no name for a part of the gap ({label}): what is named here may be a part of the same effect."
 
 
 def _remainder_text(finding: Finding) -> str:

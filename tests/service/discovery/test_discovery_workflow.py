@@ -192,6 +192,10 @@ def test_each_effect_has_to_be_needed_and_nothing_nameless_may_share_in_what_clo
         not_entered(nameless, judge(nameless))
         == "part of the gap is closed by a structure that the catalogue does not name (unnamed step:Z)"
     )
+    sign, word, text = verdict_of(nameless)
+    assert (sign, word) == ("open", "Found, but a part has no name")
+    assert "(unnamed step:Z): what is named here may be a part of the same effect." in text
+    assert verdict_of(found)[1] == "Found"
 
 
 def test_scatter_is_told_without_a_gap_that_it_cannot_close(folder: Path) -> None:
