@@ -63,7 +63,7 @@ class DiscoveryAnswer:
         return f"<abbe.Answer: {self.verdict}, {', '.join(self.effects) or 'no effect'}>"
 
 
-def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink = ignore_progress) -> DiscoveryAnswer:
+def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: ProgressSink | None = None) -> DiscoveryAnswer:
     """Find where measurement and simulation disagree, and name the missing effect.
 
     Parameters
@@ -71,7 +71,7 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     effects : tuple of Effect
         Additional effects to search for beside the catalogue; each must pass the self-test.
     progress : callable, optional
-        Receives `abbe.service.domain.progress.Progress` objects, each a line of text as `str`; e.g. ``print``.
+        Receives `abbe.service.domain.progress.Progress` objects, each a line of text as `str`; e.g. ``print``. None: nobody.
 
     Raises
     ------
@@ -83,7 +83,7 @@ def discover(campaign: Campaign, *, effects: tuple[Effect, ...] = (), progress: 
     known = catalogue()
     job = prepare(campaign, (*known, *checked(effects, {e.name for e in known})))
     journal = DiscoveryJournal()
-    finding = run_discovery(job, journal, search, progress)
+    finding = run_discovery(job, journal, search, progress or ignore_progress)
     found = {e.label: Estimate(e.strength, e.u_strength, unit(e.unit), "observed") for e in finding.effects}
     gap = {role: asdict(one) for role, one in finding.gaps.items()}
     following = None if finding.next_test is None else asdict(finding.next_test)

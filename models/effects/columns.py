@@ -67,7 +67,12 @@ def third_axis(key: str) -> int:
 
 
 def along(direction: int, *values: F1) -> F3:
-    """Return k columns of shape (n,) as deviations in one direction, shape (n, 3, k)."""
+    """Return k columns of shape (n,) as deviations along the axis of index ``direction`` (0: X, 1: Y, 2: Z), shape (n, 3, k).
+
+    `axis_of` and `direction_of` give the index that a key names. Raises ValueError for any other value.
+    """
+    if direction not in range(len(AXES)):
+        raise ValueError(f"along: direction {direction!r}, expected the index of an axis: 0 (X), 1 (Y) or 2 (Z)")
     out = np.zeros((len(values[0]), 3, len(values)))
     for k, value in enumerate(values):
         out[:, direction, k] = value

@@ -142,7 +142,7 @@ def test_recipes_may_stand_in_for_a_plan():
 
 
 def test_nothing_is_missing_where_nothing_was_added_and_an_added_effect_is_named(campaign: abbe.Campaign, tmp_path: Path):
-    assert abbe.discover(abbe.simulate(MACHINE, plan(), ERRORS)).verdict == "none"
+    assert abbe.discover(abbe.simulate(MACHINE, plan(), ERRORS), progress=None).verdict == "none"
     answer = abbe.discover(campaign)
     found = answer.effects["backlash:X"]
     assert answer.verdict == "named"

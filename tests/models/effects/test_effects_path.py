@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from abbe.models.effects.columns import before_first_turn, commanded_turns, play, rise_of, turn_between, warmth
+from abbe.models.effects.columns import along, before_first_turn, commanded_turns, play, rise_of, turn_between, warmth
 from abbe.models.effects.path import FAR_MM, Places, driven
 from abbe.models.effects.self_test import probe_paths
 
@@ -20,6 +20,12 @@ def circle(start_rad: float, n: int = 181, turns: float = 1.0) -> tuple[Places, 
     q = np.round(RADIUS_MM * np.column_stack([np.cos(angle), np.sin(angle), np.zeros(n)]), 4)
     t = (angle - start_rad) * RADIUS_MM / (FEED / 60.0)
     return driven(q, t, np.full(n, FEED), dwelling=False, temp_c={}), angle
+
+
+@pytest.mark.parametrize("direction", [3, -1, "X"])
+def test_a_direction_that_is_no_axis_is_refused_where_it_stands(direction) -> None:
+    with pytest.raises(ValueError, match=r"along: direction .*, expected the index of an axis: 0 \(X\), 1 \(Y\) or 2 \(Z\)"):
+        along(direction, np.ones(4))
 
 
 @settings(max_examples=30, deadline=None)
