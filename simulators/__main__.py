@@ -16,11 +16,16 @@ from abbe.simulators import scenario as scenarios
 from abbe.simulators.scenario import Scenario, ScenarioError
 
 
+def _complaint(text: str) -> str:
+    """One line of error as every command writes it: code, what is wrong, what to do."""
+    return f"error USE-001: {' '.join(text.split())} - correct this option or the scenario file; `abbe sim --help` lists the options\n"
+
+
 class _Parser(argparse.ArgumentParser):
     """A parser that reports errors in one line."""
 
     def error(self, message: str) -> NoReturn:
-        self.exit(2, f"{self.prog}: {message}\n")
+        self.exit(2, _complaint(f"{self.prog}: {message}"))
 
 
 def _parser(prog: str, what: str) -> _Parser:
@@ -51,7 +56,7 @@ def main(argv: Sequence[str]) -> int:
             return hidden_suite(argv[1:])
         return _truth(argv[1:]) if argv[:1] == ["truth"] else _serve(argv)
     except (ScenarioError, OSError) as exc:
-        sys.stderr.write(f"simulators: {exc}\n".replace("\n", " ").rstrip() + "\n")
+        sys.stderr.write(_complaint(f"simulators: {exc}"))
         return 2
 
 

@@ -128,7 +128,8 @@ async def _ready(process: asyncio.subprocess.Process) -> SimulatorProcess:
         return SimulatorProcess.of_line(line)
     except ValueError:
         errors = (await process.stderr.read(2000)).decode(errors="replace").strip().splitlines()
-        raise SimulatorError(f"the simulators did not start: {errors[-1] if errors else 'no reason given'}", "check the scenario") from None
+        why = errors[-1].removeprefix("error USE-001: ").partition(" - ")[0] if errors else "no reason given"
+        raise SimulatorError(f"the simulators did not start: {why}", "check the scenario") from None
 
 
 async def _end(process: asyncio.subprocess.Process) -> None:

@@ -28,8 +28,8 @@ _HEAD = """# Python
 `python -m tests.project.python_page` writes this page from the docstrings; a test checks that it is current. All names are those of `import
 abbe`; they keep their meaning within a minor version (0.2), and everything else may change. Lengths are mm, angles rad, times s, unless a
 name says otherwise. Three notebooks show them at work: [understand](../notebooks/understand.ipynb), [plan](../notebooks/plan.ipynb),
-[own effect](../notebooks/own-effect.ipynb). Start Python with `OMP_NUM_THREADS=1`, or `discover` takes about four times as long on two cores
-(50 s instead of 12 s): its matrices are too small for several threads.
+[own effect](../notebooks/own-effect.ipynb). Start Python with `OMP_NUM_THREADS=1`, or `discover` takes about four times as long on two
+cores (50 s instead of 12 s): its matrices are too small for several threads.
 """
 
 

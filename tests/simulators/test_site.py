@@ -321,7 +321,8 @@ def refused(*arguments: str) -> str:
 
 def test_errors_are_one_line_and_exit_code_2(tmp_path: Path) -> None:
     (tmp_path / "bad.toml").write_text("[machine]\nchian = 'w-X-Y-b-Z-t'\n")
-    assert refused(str(tmp_path / "bad.toml")) == "simulators: unknown key: machine.chian\n"
+    assert refused(str(tmp_path / "bad.toml")).startswith("error USE-001: simulators: unknown key: machine.chian - correct ")
+    assert refused("--speed", "0").startswith("error USE-001: simulators: speed: must be above 0 - correct this option or ")
     assert "none.toml" in refused(str(tmp_path / "none.toml"))
     assert "--nonsense" in refused("--nonsense")
     assert "speed" in refused("--speed", "0")

@@ -94,7 +94,7 @@ def test_command_refuses_what_is_no_image(tmp_path, content: bytes) -> None:
     (tmp_path / "bad.bin").write_bytes(content)
     done = run("--bank", str(tmp_path / "bad.bin"))
     assert (done.returncode, done.stdout) == (2, "")
-    assert done.stderr.startswith("simulators: bank image: ")
+    assert done.stderr.startswith("error USE-001: simulators: bank image: ")
     assert done.stderr.count("\n") == 1
 
 

@@ -70,7 +70,7 @@ class Solutions(Repository):
 
     def get(self, solution_id: int) -> SolutionRecord:
         """Read one solution. Raises NotStored."""
-        return self._get(SOLUTION, solution_id, "solution")
+        return self._get(SOLUTION, solution_id, "solution", "`abbe solve CAMPAIGN` stores one and says its number")
 
     def all(self, campaign_id: int | None = None) -> list[SolutionRecord]:
         """List solutions (of one campaign), oldest first."""

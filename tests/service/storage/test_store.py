@@ -173,7 +173,7 @@ def test_results_come_back(store: Store, campaign_id: int) -> None:
     second = store.verifications.add(1, None, "fail", {})
     assert [one.id for one in store.verifications.latest()] == [second, first]
     assert [one.id for one in store.verifications.latest(machine_id=1, limit=1)] == [second]
-    with pytest.raises(StoreError, match="no solution 99"):
+    with pytest.raises(StoreError, match=r"no solution 99 .*`abbe solve CAMPAIGN` stores one"):
         store.solutions.get(99)
 
 
