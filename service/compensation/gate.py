@@ -29,7 +29,7 @@ from abbe.service.devices.session import Session
 from abbe.service.domain.progress import ProgressSink, ignore_progress
 from abbe.service.domain.results import ProposalApproval, ProposalRejection
 from abbe.service.errors import TableRefused
-from abbe.service.push.journal import Capabilities
+from abbe.service.push.journal import PUSHED_BY, Capabilities
 from abbe.service.push.operations import Approval
 from abbe.service.push.validate import (
     Candidate,
@@ -129,7 +129,7 @@ class PushPrecheck:
         if found is None:
             raise TableRefused(why, "abbe comp approve; nothing was written")
         left_s = datetime.fromisoformat(found.expiry).timestamp() - clock.utc().timestamp()
-        return Approval(found.digest, f"{found.name}; pushed by {self.by}", found.expiry, clock.monotonic_s() + left_s)
+        return Approval(found.digest, f"{found.name}{PUSHED_BY}{self.by}", found.expiry, clock.monotonic_s() + left_s)
 
 
 async def precheck(

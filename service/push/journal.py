@@ -140,6 +140,8 @@ def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
 
 
 NOT_YET = -1
+PUSHED_BY = "; pushed by "
+"""Separates approver and pusher in ``approved_by``; without it nobody else was asked, and the only name is that of the pusher."""
 """Stands for a number that no entry has stated yet. No controller reports it, so every comparison with it fails."""
 
 

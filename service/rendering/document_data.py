@@ -123,7 +123,7 @@ WORDS = (
     "page {n} of {m}",
 )  # fmt: skip
 """Words of the templates."""
-NAMES = frozenset(("Machine", "Campaign", "Run", "File", "Authorised by", "Approved by"))
+NAMES = frozenset(("Machine", "Campaign", "Run", "File", "Authorised by", "Approved by", "Pushed by"))
 """Facts and columns whose values are names: they are never translated. The facts of a certificate are translated where they are made."""
 
 

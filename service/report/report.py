@@ -21,7 +21,7 @@ from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError, TableMismatch
-from abbe.service.push.journal import NO_PUSH, NOT_YET, JournalBroken, PushFacts, check_chain, facts, push_log
+from abbe.service.push.journal import NO_PUSH, NOT_YET, PUSHED_BY, JournalBroken, PushFacts, check_chain, facts, push_log
 from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
@@ -219,11 +219,19 @@ def _about(store: Store, journal: Sequence[PushEntry], known: PushFacts) -> dict
         "Table before": f"CRC {known.base_crc:08X}, bank {known.base_bank}" if sent else "",
         "Stored as": "" if table is None else f"table {table.id}{solution}",
         "Capability of the control": level + (", a person is present" if known.attended else ""),
-        "Approved by": known.approved_by,
+        **_who(known.approved_by),
         "Proof of sign, axis and unit": known.probe,
         "Verification": known.verify,
     }
     return {name: text for name, text in facts.items() if text}
+
+
+def _who(approved_by: str) -> dict[str, str]:
+    """Approver and pusher, as the journal states them; without an approval of another person, the pusher."""
+    approver, _, pusher = approved_by.rpartition(PUSHED_BY)
+    if approver or not pusher:
+        return {"Approved by": approver, "Pushed by": pusher}
+    return {"Pushed by": pusher, "Approval": "no second person was asked for"}
 
 
 def _holds_at(store: Store, known: PushFacts, rules: Rules) -> dict[str, str]:

@@ -254,10 +254,11 @@ def test_a_changed_reading_changes_the_hash(stored):
     assert one["Data (SHA-256)"] != other["Data (SHA-256)"]
 
 
-def test_the_push_report_shows_who_agreed_and_every_entry_of_the_journal(stored):
+def test_the_push_report_shows_who_pushed_and_every_entry_of_the_journal(stored):
     doc = json.loads(reports(stored, "push")["json"].read_text())
     assert doc["verdict"]["word"] == "Kept"
-    assert doc["about"]["Approved by"] == "A. Metrologist"
+    assert "Approved by" not in doc["about"]
+    assert (doc["about"]["Pushed by"], doc["about"]["Approval"]) == ("A. Metrologist", "no second person was asked for")
     journal = next(t for t in doc["tables"] if t["title"] == "Journal")["rows"]
     assert [r[1].split(" ")[0].rstrip(":") for r in journal][:3] == ["SNAPSHOT", "VALIDATED", "APPROVED"]
     assert not any("JOURNAL WAS CHANGED" in r for r in doc["remarks"])
