@@ -36,6 +36,7 @@ from abbe.service.report.report_table import NO_TABLE_REMARKS, TableRemarks
 from abbe.service.report.solution_sections import residual_sections, solution_sections
 from abbe.service.runs.coverage import about_axis, not_judged, path_axis, reached_mm, reached_text
 from abbe.service.runs.observations import run_data
+from abbe.service.verification.far_readings import far_angles
 from abbe.service.verification.iso_readings import approaches_of
 from abbe.service.verification.iso_report import UM, Evaluated, evaluate, positioning_rows
 from abbe.service.verification.reduction import holds_at
@@ -53,6 +54,7 @@ ANGLE_STATEMENT = (
 def evaluate_imported(campaign: Doc) -> Evaluated:
     """Evaluate ``origins``, ``readings`` and ``stated`` of a campaign; the result is empty for a campaign that Abbe measured."""
     out = Evaluated()
+    out.remarks += far_angles(campaign)
     for doc in campaign.get("readings", ()):
         _readings(out, OtherReadings.read(doc))
     for doc in campaign.get("stated", ()):

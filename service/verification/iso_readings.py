@@ -46,11 +46,17 @@ class CircleTest:
 
 
 def linear_tests(runs: Sequence[Run], refused: list[str]) -> list[AxisTest]:
-    """Positioning tests of single axes: runs of one axis in one set-up are one test. Appends unusable runs, with reason, to ``refused``."""
+    """Positioning tests of single axes. Appends unusable runs, with reason, to ``refused``."""
+    groups = linear_groups(runs)
+    return [t for (name, setup), group in groups.items() if (t := _test(name, setup, group, refused)) is not None]
+
+
+def linear_groups(runs: Sequence[Run]) -> dict[tuple[str, str], list[Run]]:
+    """Runs of one axis in one set-up, by axis and set-up: one positioning test each."""
     groups: dict[tuple[str, str], list[Run]] = {}
     for run in _open(runs, "laser_linear"):
         groups.setdefault((_axis(run), run.setup.setup_id), []).append(run)
-    return [t for (name, setup), group in groups.items() if (t := _test(name, setup, group, refused)) is not None]
+    return groups
 
 
 def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[AxisTest]]:
@@ -58,18 +64,23 @@ def diagonal_tests(runs: Sequence[Run], refused: list[str]) -> dict[str, list[Ax
 
     Appends unusable runs, with reason, to ``refused``.
     """
+    out: dict[str, list[AxisTest]] = {}
+    for (plane, name, setup_id), group in diagonal_groups(runs).items():
+        test = _test(name, setup_id, group, refused)
+        if test is not None and name not in {t.name for t in out.get(plane, [])}:  # the first of repeated measurements counts
+            out.setdefault(plane, []).append(test)
+    return out
+
+
+def diagonal_groups(runs: Sequence[Run]) -> dict[tuple[str, str, str], list[Run]]:
+    """Runs of plain diagonals, by group (as `diagonal_tests`), diagonal and set-up."""
     groups: dict[tuple[str, str, str], list[Run]] = {}
     for run in _open(runs, "laser_diagonal"):
         setup = run.laser
         if not setup.order:
             name = "".join(setup.diagonal["XYZ".index(a)] for a in setup.face) if setup.face else setup.diagonal
             groups.setdefault((setup.face or "body", name, setup.setup_id), []).append(run)
-    out: dict[str, list[AxisTest]] = {}
-    for (plane, name, setup_id), group in groups.items():
-        test = _test(name, setup_id, group, refused)
-        if test is not None and name not in {t.name for t in out.get(plane, [])}:  # the first of repeated measurements counts
-            out.setdefault(plane, []).append(test)
-    return out
+    return groups
 
 
 def circle_tests(runs: Sequence[Run], refused: list[str]) -> list[CircleTest]:
@@ -123,7 +134,7 @@ def _test(name: str, setup: str, group: list[Run], refused: list[str]) -> AxisTe
 def _approaches(name: str, group: list[Run]) -> Approaches:
     cells: dict[tuple[float, int], list[float]] = {}
     for run in group:
-        position, sign, value = _readings(run, name)
+        position, sign, value = readings_along(run, name)
         for p, s, v in zip(position, sign, value, strict=True):
             cells.setdefault((float(p), int(s)), []).append(float(v))
     return approaches_of(cells, {p for run in group for p in _turning_points(run, name)})
@@ -143,8 +154,16 @@ def approaches_of(cells: Mapping[tuple[float, int], list[float]], turns: Collect
     return Approaches(np.array(places), *sides)
 
 
-def _readings(run: Run, name: str) -> tuple[F1, F1, F1]:
-    """Position, direction and deviation of the valid readings along the positive sense of the axis, mm."""
+def readings_along(run: Run, name: str) -> tuple[F1, F1, F1]:
+    """Position, direction and deviation of the valid readings along the positive sense of the axis, mm.
+
+    Raises
+    ------
+    MeasurementFault
+        The run does not move along this axis, or a valid deviation is not a number.
+    ValueError
+        The set-up states no start or no end.
+    """
     axes, keep, deviation = run.columns.q_mm, run.columns.valid, run.columns.readings_mm
     way, start = run.laser.span_mm, run.laser.ends_mm[0]
     if len(name) == 1:

@@ -22,6 +22,7 @@ from abbe.service.rendering.numbers import plain, tidy
 from abbe.service.rendering.plots.curves import PositioningCurves, positioning_plot
 from abbe.service.rendering.plots.polar import polar_plot
 from abbe.service.runs.coverage import not_judged
+from abbe.service.verification.far_readings import far_readings
 from abbe.service.verification.iso_readings import AxisTest, CircleTest, circle_tests, diagonal_tests, linear_tests
 from abbe.service.verification.reduction import (
     AT_20,
@@ -92,6 +93,7 @@ def evaluate(
     refused = [f"run {run.run_id}: {why}" for run in runs if (why := not_judged(run))]
     runs = [run for run in runs if not not_judged(run)]
     linear, along, circles = linear_tests(runs, refused), diagonal_tests(runs, refused), circle_tests(runs, refused)
+    out.remarks += far_readings(runs)
     out.not_observable += [f"figures by ISO 230 of {line}" for line in refused]
     for test in linear:
         its_runs = [run for run in runs if run.run_id in test.runs]

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from abbe.service.instrument_files.campaign import Made
     from abbe.service.instrument_files.columns import ColumnFile
     from abbe.service.instrument_files.content import Content
+    from abbe.service.runs.exchange import FolderContent
 
 NOT_STORED = 1
 
@@ -124,11 +125,19 @@ def _import_points(files: list[Path], name: str, where: tuple[str | None, Path |
 def _import_folder(folder: Path, db: str | None, machine: Path | None, *, as_json: bool) -> None:
     from abbe.service.runs.exchange import import_folder, read_folder
 
-    read_folder(folder)  # before a database is created
+    _warn(read_folder(folder))  # before a database is created
     with open_store(database_url(db, machine), must_exist=False) as store:
         record = store.campaigns.find(import_folder(store, folder))
         _said(record.name, len(store.runs.all(record.id)), store.url, as_json=as_json)
     conclude(f"abbe solve {quote(record.name)}", machine=machine, db=db, as_json=as_json)
+
+
+def _warn(folder: FolderContent) -> None:
+    """Name readings that may be blunders on standard error; they are stored, too."""
+    from abbe.service.verification.far_readings import far_angles, far_readings
+
+    for line in (*far_readings(folder.runs), *far_angles(folder.campaign)):
+        typer.echo(f"warning: {line}", err=True)
 
 
 def _said(campaign: str, runs: int, url: str, *, beside: int = 0, as_json: bool) -> None:
@@ -160,6 +169,7 @@ def _import_contents(
     made = campaign_of(contents, answers, name, None if site is None else site.doc)
     if not as_json:
         _preview(contents, answers, made)
+    _warn(made.folder)
     if not yes and not (sys.stdin.isatty() and typer.confirm("Store this campaign?")):
         text = "nothing was stored" + ("" if sys.stdin.isatty() else ": --yes stores it")
         answer({"campaign": None, "runs": 0, "text": text}, text, as_json=as_json)

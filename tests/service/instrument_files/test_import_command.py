@@ -109,6 +109,21 @@ def test_several_files_of_one_machine_are_one_campaign(abbe: Abbe) -> None:
     assert groups == {"Axis X, set-up L1", "Axis Y, set-up L2"}
 
 
+def test_a_reading_far_from_the_others_is_named_and_imported(abbe: Abbe) -> None:
+    """490 typed as 590: the import and the report name it, and no figure leaves it out."""
+    runs = [[2.5 * (k % 2) + 0.1 * ((7 * k + t) % 5) for t in range(5)] for k in range(6)]
+    runs[3][2] = 100000.0
+    Path("typed.rtl").write_text(renishaw(runs, [100.0 * t for t in range(5)]))
+    done = abbe("import", "typed.rtl", "--yes")
+    assert done.code == 0, done.err
+    assert done.err.startswith("warning: run r01, the reading at X 200 mm, moving in -, lies 100000 µm")
+    assert done.err.count("warning:") == 1
+    found = report(abbe, "typed")
+    assert (figures(found)["A"][0] or 0.0) > 1e5
+    assert done.err.partition(": ")[2].splitlines()[0] in found["remarks"]
+    assert "warning" not in abbe("import", "x.rtl", "--yes").err
+
+
 def test_angles_are_evaluated_beside(abbe: Abbe) -> None:
     Path("x.rta").write_text(renishaw(kind="rta", runs=[(0.0, 0.010, 0.004), (0.001, 0.012, 0.005)]))
     abbe("import", "x.rta", "--yes", "--name", "pitch")
