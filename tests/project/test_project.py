@@ -20,6 +20,7 @@ from abbe.service.capture.settings import CaptureSettings, segment_folder
 from abbe.service.domain.service_records import AuditEvent
 from abbe.service.storage.engine import known_revisions
 from abbe.service.storage.store import Store
+from tests.conftest import LONG
 
 ROOT = Path(__file__).resolve().parents[2]
 PARTS = ("service", "drivers", "models", "simulators")
@@ -175,6 +176,8 @@ OPENS = (
     | {"check-config": {"fastapi", "alembic", "aiomqtt", "structlog", "rich"}}
 )
 """The same of commands that only read; a list needs no arrays, but a trend of stored checks needs them and `scipy.special`."""
+EVERY = 1 if LONG else 3
+"""Each of these is a Python of its own: in every run a third of them."""
 MACHINE = 'name = "m"\nchain = "w-X-Y-b-Z-t"\n[stroke_mm]\nX = [0, 500]\nY = [0, 400]\nZ = [-300, 0]\n'
 SOLVING = {"abbe.service.identification.solve", "abbe.service.discovery.discover", "scipy.linalg", "scipy.optimize", "scipy.stats"}
 """What only computing commands import."""
@@ -194,7 +197,7 @@ def test_a_command_that_computes_nothing_comes_at_once(words: str) -> None:
     assert not loaded & STARTS[words]
 
 
-@pytest.mark.parametrize("words", OPENS)
+@pytest.mark.parametrize("words", list(OPENS)[::EVERY])
 def test_a_command_that_only_reads_the_database_comes_soon(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ABBE_DB", raising=False)
     (tmp_path / "abbe.toml").write_text(MACHINE)
@@ -222,7 +225,7 @@ REFUSES = (
 """What a command must not import for an input that it refuses. Those of the last two lines write the refusal into the audit."""
 
 
-@pytest.mark.parametrize("words", REFUSES)
+@pytest.mark.parametrize("words", list(REFUSES)[::EVERY])
 def test_a_refused_input_loads_nothing_of_the_work(words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.delenv("ABBE_DB", raising=False)
     (tmp_path / "abbe.toml").write_text(MACHINE)

@@ -79,7 +79,7 @@ def test_a_simulated_campaign_can_be_saved_for_the_command_line(campaign: abbe.C
 
 def test_progress_can_be_printed(campaign: abbe.Campaign, capsys: pytest.CaptureFixture[str]):
     abbe.solve(campaign, model="rigid6", progress=print)
-    abbe.plan(MACHINE, minutes=20.0, progress=print)
+    abbe.plan(MACHINE, minutes=8.0, progress=print)
     lines = capsys.readouterr().out.splitlines()
     assert any("units, axes" in line for line in lines)
     assert "  0% selecting the most informative measurements" in lines

@@ -98,14 +98,16 @@ def test_a_change_is_in_the_file_in_the_service_in_the_commands_and_in_the_audit
     page = desk.changed("limits", "approver", **looser, looser="yes", reason="new bearings, agreed with the plant")
     assert 'name="verify.helix_rms_um" inputmode="decimal" maxlength="30" autocomplete="off" value="6.5"' in page
     assert (COMMENT in desk.file.read_text(), "helix_rms_um = 6.5  # of the maker" in desk.file.read_text()) == (True, True)
-    desk.changed("certificates", "approver", **{"calibration.ballbar": "2031-05-31"}, looser="yes", reason="certificate K-88")
+    if LONG:  # each change is a start of the service
+        desk.changed("certificates", "approver", **{"calibration.ballbar": "2031-05-31"}, looser="yes", reason="certificate K-88")
     name = {f"schedule[1].{key}": value for key, value in {"name": "week", "cron": "0 6 * * 1", "timezone": "UTC"}.items()}
     refused = desk.post("schedule", "admin", **name)
     assert (refused.status_code, "allows more than before" in refused.json()["detail"]) == (409, True)
     desk.changed("schedule", "admin", **name, looser="yes", reason="agreed with the shift")
     due = desk.running.http.get("/api/v1/status", headers=desk.running.who["viewer"]).json()["next_due"]
     assert [one["schedule"] for one in due] == ["week"]
-    desk.changed("schedule", "admin", **{"schedule[1].name": "week", "remove": "yes"})
+    if LONG:
+        desk.changed("schedule", "admin", **{"schedule[1].name": "week", "remove": "yes"})
     with Store.open(url_of(desk.file.parent)) as store:
         assert AuditBook(store, url_of(desk.file.parent)).verify() == []
         told = [
@@ -115,8 +117,8 @@ def test_a_change_is_in_the_file_in_the_service_in_the_commands_and_in_the_audit
         ]
         digests = [one.doc["sha256"] for one in store.audit.events() if one.action == "abbe serve"]
     assert told[1] == ("token:a-approver/test", "verify.helix_rms_um 5.0 → 6.5", "new bearings, agreed with the plant")
-    assert len(told) == 5
-    assert len(set(digests)) == 6, "each life of the service names the file that it had"
+    assert len(told) == (5 if LONG else 3)
+    assert len(set(digests)) == len(told) + 1, "each life of the service names the file that it had"
 
 
 def test_what_may_not_be_is_refused_and_the_file_stays(desk: Desk) -> None:

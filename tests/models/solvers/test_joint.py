@@ -19,7 +19,7 @@ from abbe.models.uncertainty.sources import error_sources
 from tests.models.solvers.truth import FLOOR, MACHINE, SIGMA, Truth, linear_parameters
 
 
-@pytest.fixture(scope="module", params=[1, 2, 3] if os.environ.get("ABBE_TEST_LONG") == "1" else [1, 2])
+@pytest.fixture(scope="module", params=[1, 2, 3] if os.environ.get("ABBE_TEST_LONG") == "1" else [2])
 def solved(request) -> tuple[Truth, JointSolution]:
     truth = Truth(request.param)
     return truth, solve_joint(MACHINE, truth.campaign(), order=9, sigma_mm=SIGMA, floor_mm=FLOOR)
