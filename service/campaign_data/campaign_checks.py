@@ -51,7 +51,11 @@ TIME_UNITS = {1e3: "t_s holds ms", 1.0 / 60.0: "t_s holds minutes"}
 
 
 def time_issues(runs: Sequence[Run]) -> list[CampaignIssue]:
-    """Return flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs."""
+    """Return flags of runs whose clocks disagree, whose t_s does not fit their feed, or which overlap other runs.
+
+    Runs of files without times are not judged.
+    """
+    runs = [run for run in runs if not run.timing.counted]
     out = [f for run in runs for f in (*_clocks(run), *_against_feed(run))]
     known = {f.run for f in out}
     return out + _overlaps([r for r in runs if r.run_id not in known])

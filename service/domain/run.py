@@ -328,10 +328,12 @@ class RunPart:
 class RunTiming:
     """Agreement of the clocks of a ball-bar run (`abbe.service.runs.sample_columns`).
 
-    ``trouble``: their disagreement, empty if they agree; ``pieces``: pieces of a resumed path; ``document``: all figures as stored.
+    ``trouble``: their disagreement, empty if they agree; ``counted``: an imported file has no times, and t_s only counts its readings;
+    ``pieces``: pieces of a resumed path; ``document``: all figures as stored.
     """
 
     trouble: str = ""
+    counted: bool = False
     pieces: tuple[RunPart, ...] = ()
     document: Doc = field(default_factory=dict, repr=False)
 
@@ -340,7 +342,7 @@ class RunTiming:
         """Parse ``timing`` of a run; None counts as empty."""
         known = doc or {}
         pieces = tuple(RunPart(run=str(one["run"]), readings=int(one["readings"])) for one in known.get("pieces", ()))
-        return cls(trouble=str(known.get("trouble") or ""), pieces=pieces, document=known)
+        return cls(trouble=str(known.get("trouble") or ""), counted=known.get("counted") is True, pieces=pieces, document=known)
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from abbe.models.arrays import F1
 from abbe.models.machine import AXES
 from abbe.service.domain.document import Doc
-from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
+from abbe.service.domain.run import PLACES, Columns, Run, RunTiming, parsed_setup
 from abbe.service.domain.run_file import ASSUMED_MODEL, CAMPAIGN_FORMAT, CampaignFile, SourceFile
 from abbe.service.errors import FileFormatError
 from abbe.service.instrument_files.answers import LENGTHS, Answers, laser_of, settled, unknown_of
@@ -26,6 +26,8 @@ PAUSE_S = 60.0
 """Time between the tests of two files on the campaign's clock, s, if their times are unknown."""
 MOST_SAMPLES = 100_000
 """Largest number of values from a trace; a longer one is averaged in blocks."""
+COUNTED = RunTiming.from_document({"counted": True})
+"""Timing of a run whose file has no times."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +65,10 @@ def campaign_of(contents: Sequence[Content], answers: Answers, name: str, machin
     measured += [(axis, columns[f"{axis.lower()}_mm"]) for columns, axis in traces]
     made = machine or _assumed_machine(contents, measured)
     runs, start = list[Run](), 0.0
-    for columns, axis in [*((_columns(test), test.axis) for test in linear), *traces]:
+    timings = [COUNTED if test.t_s is None else RunTiming() for test in linear] + [RunTiming() for _ in traces]
+    for (columns, axis), timing in zip([*((_columns(test), test.axis) for test in linear), *traces], timings, strict=True):
         run = _run(name, len(runs) + 1, made, axis, {k: v + start if k == "t_s" else v for k, v in columns.items()})
+        run = replace(run, timing=timing)
         start = float(run.columns.t_s[-1]) + PAUSE_S
         runs.append(run)
     origins = [_origin(*one, machine) for one in zip(contents, tests, strict=True)]

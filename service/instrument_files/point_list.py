@@ -18,10 +18,10 @@ from abbe.models.arrays import F2
 from abbe.models.geometry.rotation import matrix_zyx
 from abbe.service.domain.artefact import ARTEFACT_TEST, MACHINE_PROBE
 from abbe.service.domain.document import Doc
-from abbe.service.domain.run import PLACES, Columns, Run, parsed_setup
+from abbe.service.domain.run import PLACES, Columns, Run, RunTiming, parsed_setup
 from abbe.service.errors import FileFormatError
 from abbe.service.formats.files import TextFile
-from abbe.service.instrument_files.campaign import ASSUMED_CHAIN, checked_campaign
+from abbe.service.instrument_files.campaign import ASSUMED_CHAIN, COUNTED, checked_campaign
 from abbe.service.instrument_files.content import read_bytes, text_file
 from abbe.service.runs.exchange import FolderContent
 
@@ -200,7 +200,7 @@ def _run(one: PointList, campaign: str, label: str, machine: Doc, columns: Colum
     }  # fmt: skip
     return Run(
         campaign=campaign, run_id=label, test=ARTEFACT_TEST, role="identify", machine=machine,
-        setup=parsed_setup(ARTEFACT_TEST, setup), columns=columns,
+        setup=parsed_setup(ARTEFACT_TEST, setup), columns=columns, timing=RunTiming() if "t_s" in one.columns else COUNTED,
     )  # fmt: skip
 
 

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from abbe.models.arrays import F1
 from abbe.models.evaluation.iso230_2 import ScaleBudget, Value, positioning
 from abbe.models.machine import AXES
 from abbe.models.solvers.observations import nominal_reading
@@ -340,10 +341,7 @@ def _own(run: Run) -> Evaluated:
     above = (data.deviation_mm - nominal_reading(data)) * 1e3
     group, columns = "Readings", run.columns
     rows = [ReportFigure(group, "n", f"valid readings of {len(columns)}", float(columns.valid.sum()), None, "", "count")]
-    series = ResidualSeries(data.label, "time of the campaign in s", data.t_s, above)
-    pictures = [
-        PictureBlock(f"Run {data.label}: deviation against time, as read.", [residual_plot(series, noise_um=None, key="readings")], "wide")
-    ]
+    pictures = [_as_read(run, data.label, data.t_s, above)]
     if why := not_judged(run):
         return Evaluated(figures=rows, pictures=pictures, not_observable=[f"any figure of the whole path: {why}"])
     rows += [
@@ -371,6 +369,14 @@ def _own(run: Run) -> Evaluated:
         text = f"Deviation of the helix around its axis ({AXES[axis]}), after a fit of centre and bar length."
         pictures.append(PictureBlock(text, [polar_plot([PolarTrace(data.label, angle, found.deviation_mm * 1e3)], heading="Helix")]))
     return Evaluated(figures=rows, pictures=pictures)
+
+
+def _as_read(run: Run, label: str, t_s: F1, above_um: F1) -> PictureBlock:
+    """The readings of a run over the time, or one after the other if their times are not known."""
+    series, caption = ResidualSeries(label, "time of the campaign in s", t_s, above_um), "deviation against time, as read"
+    if run.timing.counted:
+        series, caption = ResidualSeries(label, "reading", np.arange(float(above_um.size)), above_um), "deviation, reading by reading"
+    return PictureBlock(f"Run {label}: {caption}.", [residual_plot(series, noise_um=None, key="readings")], "wide")
 
 
 def _value_text(value: Any) -> str:

@@ -95,7 +95,7 @@ def conditions(runs: Sequence[Run], rules: Rules) -> tuple[dict[str, str], list[
     feeds = [float(v) for r in runs for v in r.columns.feed_mm_min if v > 0.0]  # 0: not known
     if feeds:
         out["Feed"] = f"{min(feeds):.0f} to {max(feeds):.0f} mm/min" if min(feeds) != max(feeds) else f"{feeds[0]:.0f} mm/min"
-    spans = [float(r.columns.t_s[-1] - r.columns.t_s[0]) for r in runs if len(r.columns)]
+    spans = [float(r.columns.t_s[-1] - r.columns.t_s[0]) for r in runs if len(r.columns) and not r.timing.counted]
     if spans:
         out["Time in the runs"] = f"{sum(spans) / 60.0:.1f} min in {len(spans)} runs"
     tables = sorted({f"bank {t.bank}, CRC {t.crc:08X}" for r in runs if (t := r.table).crc is not None and t.bank is not None})

@@ -47,6 +47,19 @@ def test_a_file_becomes_figures_of_iso_230_2(abbe: Abbe) -> None:
     )
 
 
+def test_times_that_no_file_states_are_neither_judged_nor_printed(abbe: Abbe) -> None:
+    """With a feed the numbers of the readings would look like minutes: 110 readings on 5 m at 20 mm/min."""
+    targets = [50.0 * k for k in range(11)]
+    runs = [[round(-0.02 * t + 0.1 * ((7 * k + t / 50) % 5), 1) for t in targets] for k in range(10)]
+    Path("x.rtl").write_text(renishaw(runs, targets))
+    assert abbe("import", "x.rtl", "--yes", "--feed", "20").code == 0
+    found, run = report(abbe, "x"), report(abbe, "x/r01")
+    assert not {"Time in the runs"} & {*found["conditions"], *run["conditions"]}
+    told = abbe("solve", "x", "--model", "rigid6")
+    assert told.code == 0, told.err
+    assert "t_s" not in told.out + told.err
+
+
 def test_nothing_is_stored_before_somebody_has_seen_it(abbe: Abbe) -> None:
     done = abbe("import", "x.rtl")
     assert done.code == 1
