@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from abbe.service.domain.people import Permission
 from abbe.service.rendering.numbers import Unit
+from abbe.service.users.people import LOCAL_VIEWER
 from abbe.service.web import language, units
 from abbe.service.web.language import DEFAULT, NAMES
 from abbe.service.web.login.auth_middleware import Visit
@@ -89,6 +90,11 @@ class Frame:
     def may(self, need: Permission) -> bool:
         """Whether the visitor has a permission."""
         return self.visit is not None and need in self.visit.principal.permissions
+
+    @property
+    def without_users(self) -> bool:
+        """Whether there is no user at all, so that everybody may look and nobody may change anything."""
+        return self.visit is not None and self.visit.principal == LOCAL_VIEWER
 
     def links(self, screens: Sequence[Screen] = SCREENS) -> list[Link]:
         """The existing screens that the visitor may see."""
