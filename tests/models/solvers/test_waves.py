@@ -14,13 +14,15 @@ SIGMA_MM = 3e-4
 SEEDS = 6 if os.environ.get("ABBE_TEST_LONG") == "1" else 3
 
 
-def touched(waves_um: dict[float, float], seed: int, scatter_um: float = 0.0, *, form: bool = False) -> Displacements:
+def touched(
+    waves_um: dict[float, float], seed: int, scatter_um: float = 0.0, *, form: bool = False, pitch_mm: float = PITCH_MM
+) -> Displacements:
     """Displacements at six features a pitch apart in four poses on X and Y; a straight line in them is unknown.
 
     ``form``: the places of the features are unknown, too; the poses are 0, 90, 180 and 270 degrees, so X and Y read the same features.
     """
     rng = np.random.default_rng(seed)
-    place = np.concatenate([start + PITCH_MM * np.arange(6) for start in (103.1, 131.7, 74.9, 166.3)])
+    place = np.concatenate([start + pitch_mm * np.arange(6) for start in (103.1, 131.7, 74.9, 166.3)])
     at, axis = np.tile(place, 2), np.repeat([0, 1], place.size)
     phase = rng.uniform(0.0, 2.0 * np.pi, (2, len(waves_um)))
     true = sum(
@@ -57,6 +59,17 @@ def test_two_periods_are_found_where_only_both_axes_together_show_them() -> None
         assert any(p.weight > SURE and abs(p.frequency - 0.1) < 3.0 * p.u_frequency for p in found), seed
         pairs += any(p.weight > 0.3 and abs(p.frequency - 0.075) < 3.0 * p.u_frequency for p in found)
     assert pairs >= 6
+
+
+@pytest.mark.parametrize(("pitches", "least", "most"), [(4.0, -1e-9, 1e-9), (3.99, -1e-9, 4.0), (4.26, 50.0, np.inf), (4.5, 50.0, np.inf)])
+def test_a_period_that_divides_the_pitch_is_hidden(pitches: float, least: float, most: float) -> None:
+    """Such a wave only shifts each pose, and poses are unknown. What the readings show of it is in units of its prior."""
+    period = 40.0 / 3.0
+    data = touched({}, 1, form=True, pitch_mm=pitches * period)
+    wave = data.waves((0, 1), np.array([1.0 / period]))[0]
+    shown = np.linalg.eigvalsh(wave.T @ data.information @ wave)
+    assert least <= shown[0]
+    assert shown[-1] <= most
 
 
 @pytest.mark.parametrize("seed", range(SEEDS))
