@@ -5,12 +5,11 @@ Variance effects are found in the residuals of the mean model and then excluded 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 
-from abbe.models.arrays import F1, F2
 from abbe.models.discovery.answer import Discovery
 from abbe.models.discovery.baseline import baseline_of
 from abbe.models.discovery.candidate_bank import Pick
@@ -19,9 +18,10 @@ from abbe.models.discovery.finding import doubted, finding
 from abbe.models.discovery.lack import CHANCE
 from abbe.models.discovery.mixed_up import mixed_up, wrong_tool
 from abbe.models.discovery.selection import Contest, Rival, Selection, dropped, rivals_of, selected, weighed
-from abbe.models.discovery.solved_model import predictions, solve, whole_rest
-from abbe.models.discovery.variance.scatter_effects import VarianceFinding, extra_variance, rough_place, teeth_mm2
-from abbe.models.discovery.whitened_problem import Tangent, WhitenedProblem, linearised, whiten, with_estimated_noise, with_projection
+from abbe.models.discovery.solved_model import predictions, solve
+from abbe.models.discovery.variance.rounds import scattered, without
+from abbe.models.discovery.variance.scatter_effects import VarianceFinding
+from abbe.models.discovery.whitened_problem import WhitenedProblem, linearised, whiten, with_estimated_noise
 from abbe.models.effects.effect import Effect
 
 ShareSink = Callable[[str, float], None]
@@ -30,55 +30,6 @@ CLEAR = 1.0
 """A rival replaces a named effect if its chi-square is lower by at least this; a new name needs the same margin."""
 ROUNDS = 3
 """Maximum number of repetitions of the search, each with noise and simulation refitted together with the findings."""
-
-
-def scattered(problem: WhitenedProblem, picks: Sequence[Pick], known: Sequence[VarianceFinding]) -> tuple[VarianceFinding, ...]:
-    """Find variance effects beside the ``known`` ones in the residuals of simulation and ``picks``, which include laser outliers."""
-    solved = solve(problem, picks)
-    white = whole_rest(problem, solved)
-    sigma = tuple(problem.colours[k].sd_mm for k in problem.kinds)
-    leverage = tuple(problem.by_run(problem.projection.leverage))
-    alone = tuple(problem.by_run(1.0 - problem.lone(white * problem.sd_mm())))
-    return extra_variance(
-        problem.paths, tuple(problem.by_run(white)), sigma, leverage=leverage, colours=problem.colours, alone=alone, known=known
-    )
-
-
-def without(problem: WhitenedProblem, findings: Sequence[VarianceFinding]) -> WhitenedProblem:
-    """Remove variance effects: project vibrations out of each ball-bar run, and weight readings with excess scatter down."""
-    waves, use = [problem.also], problem.use
-    for f in findings:
-        if f.name == "vibration":
-            waves.append(_waves(problem, "XYZ".index(f.key), f.parameters["frequency_hz"]))
-        elif f.name == "stick_slip":
-            use = use / np.sqrt(1.0 + teeth_mm2(problem.paths, f) / np.square(problem.sd_mm()))
-        elif f.name == "unnamed_rough":
-            there = np.concatenate(rough_place(problem.paths, f.key))
-            use = use * np.where(there > 0, 1.0 / f.parameters["times"], 1.0)
-        elif f.name == "unnamed_burst":
-            use = use * (1.0 - _burst(problem, f.parameters["t0_s"], f.parameters["width_s"]))
-    problem = replace(problem, also=np.concatenate(waves, axis=1))
-    if (use != problem.use).any():
-        tangent = Tangent.of(problem.tangent.raw, use, problem.lengths, problem.kinds, problem.colours)
-        problem = replace(problem, use=use, tangent=tangent)
-    return with_projection(problem)
-
-
-def _waves(problem: WhitenedProblem, axis: int, frequency_hz: float) -> F2:
-    """Columns of a vibration along an axis: a sine and a cosine for every ball-bar run, mm per mm."""
-    out = np.zeros((problem.gap.size, 2 * sum(k == "bar" for k in problem.kinds)))
-    start = column = 0
-    for path in problem.paths:
-        if path.kind == "bar":
-            phase = 2.0 * np.pi * frequency_hz * (path.at.t_s - path.at.t_s[0])
-            out[start : start + path.n, column : column + 2] = path.look[:, axis, None] * np.stack([np.sin(phase), np.cos(phase)], axis=1)
-            column += 2
-        start += path.n
-    return out
-
-
-def _burst(problem: WhitenedProblem, t0_s: float, width_s: float) -> F1:
-    return np.concatenate([(np.abs(p.at.t_s - t0_s) < 1.5 * width_s) * float(p.kind == "bar") for p in problem.paths])
 
 
 def discover(case: Case, effects: tuple[Effect, ...], *, progress: ShareSink | None = None) -> Discovery:

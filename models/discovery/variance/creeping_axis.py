@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from abbe.models.arrays import F1
+from abbe.models.arrays import F1, F2
 from abbe.models.discovery.instrument_noise import CREEP_MM_S
 from abbe.models.discovery.variance.spectrum import BAND, GATES_MM_S, RoughnessFit, height, roughness_of
 from abbe.models.effects.path import Path
@@ -77,18 +78,23 @@ def scatter_along(axis: int, paths: tuple[Path, ...], rest: tuple[F1, ...], sigm
 
 
 def without_band(frequency_hz: float, axis: int, path: Path, rest: F1) -> F1:
-    """Project a wave along an axis with a slowly changing amplitude (`BAND`) out of the residuals of a run; exact zeros stay.
+    """Project a wave along an axis with a slowly changing amplitude (`band`) out of the residuals of a run; exact zeros stay."""
+    base = band(frequency_hz, axis, path, rest != 0.0)
+    return np.asarray(rest - base @ (base.T @ rest))
 
-    A run too short for that keeps its residuals.
+
+def band(frequency_hz: float, axis: int, path: Path, read: NDArray[np.bool_]) -> F2:
+    """Return an orthonormal basis, shape (n, k), of waves along an axis whose amplitude changes slowly (`BAND`), zero where not ``read``.
+
+    A run too short for that has none (k = 0).
     """
     t = path.at.t_s - path.at.t_s[0]
     if path.n < 2 * (2 * BAND + 1) or t[-1] <= 0.0:
-        return rest
+        return np.zeros((path.n, 0))
     cycles = frequency_hz * t[:, None] + np.outer(t / t[-1], np.arange(-BAND, BAND + 1))
     waves = np.concatenate([np.cos(2.0 * np.pi * cycles), np.sin(2.0 * np.pi * cycles)], axis=1) * path.look[:, axis, None]
-    base, size, _ = np.linalg.svd(waves * (rest != 0.0)[:, None], full_matrices=False)
-    base = base[:, size > SINGULAR * size[0]]
-    return np.asarray(rest - base @ (base.T @ rest))
+    base, size, _ = np.linalg.svd(waves * read[:, None], full_matrices=False)
+    return np.asarray(base[:, size > SINGULAR * size[0]] * read[:, None])  # rounding leaves 1e-17 there
 
 
 def at_standstill(height: float, u: float, v_mm_s: float) -> tuple[float, float, float]:

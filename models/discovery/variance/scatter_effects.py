@@ -64,8 +64,8 @@ LEAST_LASER = 60
 """Minimum number of laser readings for estimating a rate of 1 in 100."""
 DRIVES = ("stick_slip", "vibration")
 OVERSHADOWS = 3.0
-"""Vibration or stick-slip of one axis shows a little along the others, so a finding whose evidence is weaker by this factor counts as
-explained. A second vibration of less than about 0.6 of the first's size is therefore not named."""
+"""Vibration or stick-slip of one axis shows a little along the others, so a finding of the same round whose evidence is weaker by this
+factor counts as explained. The next round tests it again, without the stronger one."""
 GATE = 1.3
 """Readings below this multiple of the stick-slip speed scatter."""
 SAW_P, TOOTH = 0.05, 0.5 * np.pi
@@ -189,7 +189,8 @@ def extra_variance(
         Noise with which the residuals were whitened; default: white noise.
     alone : one array (n,) per run, optional
         1 for single wrong readings (`abbe.models.discovery.instrument_noise.lone`); a ball-bar's are tested as outliers and rough places.
-    known : findings from before, with other residuals
+    known : findings from before, which the residuals no longer contain (`abbe.models.discovery.variance.rounds.calmed`)
+        An axis with a vibration or a stick-slip among them gets no second one, and a burst is explained by a stronger one as before.
         Readings that a stick-slip among them makes scatter are not tested as outliers.
 
     Returns
@@ -198,14 +199,15 @@ def extra_variance(
         Evidence above zero only, highest first.
     """
     tried = candidates(paths, whitened, sigma_mm, leverage=leverage, colours=colours, alone=alone, known=known)
-    found = [f for f in tried if f.evidence > 0]
+    once = {f.key for f in known if f.name in DRIVES}
+    found = [f for f in tried if f.evidence > 0 and not (f.name in DRIVES and f.key in once)]
     out: list[VarianceFinding] = []
     for finding in sorted(found, key=lambda f: -f.evidence):
         if finding.name in DRIVES and any(_overshadows(o, finding) for o in out):
             continue
         if finding.name in (*DRIVES, "unnamed_burst") and any(o.name == "unnamed_rough" for o in out):
             continue
-        if finding.name == "unnamed_burst" and any(o.name in DRIVES and 3.0 * o.evidence > finding.evidence for o in found):
+        if finding.name == "unnamed_burst" and any(o.name in DRIVES and 3.0 * o.evidence > finding.evidence for o in (*known, *found)):
             continue
         if finding.name == "unnamed_burst" and any(o.name == "bar_outliers" and o.evidence > OVERSHADOWS * finding.evidence for o in out):
             continue

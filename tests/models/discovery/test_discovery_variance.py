@@ -10,9 +10,9 @@ import scipy
 
 from abbe.models.arrays import F1
 from abbe.models.discovery.baseline import baseline_of
-from abbe.models.discovery.discover import without
 from abbe.models.discovery.instrument_noise import Colour, comes_back, lone, remembered, unscaled
 from abbe.models.discovery.localization import Localization
+from abbe.models.discovery.variance.rounds import without
 from abbe.models.discovery.variance.scatter_effects import (
     VarianceFinding,
     candidates,
