@@ -290,7 +290,7 @@ def _bounds(c: Components, model: SizeModel) -> tuple[F1, F1]:
 def _positive(info: F2, least: float) -> F2:
     """Raise eigenvalues to at least ``least``; smaller ones come only from rounding (readings without noise)."""
     with suppress(np.linalg.LinAlgError):  # nearly always; it takes a twentieth of the time of the eigenvalues
-        scipy.linalg.cholesky(info - least * np.eye(len(info)), check_finite=False)
+        scipy.linalg.cholesky(info - least * np.eye(len(info)))
         return info
     values, vectors = scipy.linalg.eigh(info)
     return np.asarray((vectors * np.maximum(values, least)) @ vectors.T)

@@ -158,15 +158,24 @@ def warn_of_readers(url: str) -> None:
 
 
 def run_or_campaign(store: Store, name: str) -> RunRecord | CampaignRecord:
-    """Return the campaign of this name, else the run. A run with the label of a campaign is CAMPAIGN/RUN, or its number.
+    """Return the campaign of this name, else the run; of a number the run. A run with the label of a campaign is CAMPAIGN/RUN.
 
     Raises
     ------
     StoreError
         Neither is in the database, or several runs have this label.
     """
-    found = next((one for one in store.campaigns.all() if one.name == name), None)
-    return store.runs.find(name) if found is None else found
+    from abbe.service.errors import NotStored
+
+    named = [one for one in store.campaigns.all() if one.name == name]
+    if named and not name.isdecimal():
+        return named[0]
+    try:
+        return store.runs.find(name)
+    except NotStored:
+        if not named:
+            raise
+        return named[0]
 
 
 def check_endings(*targets: Path | None) -> None:

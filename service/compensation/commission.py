@@ -18,6 +18,7 @@ from abbe.models.arrays import F2
 from abbe.models.compensation.sign_probe import Shift, SignProof, bar_shift, sign_proof, step_tables
 from abbe.models.compensation.tables import NineTables, grid_positions, quantise
 from abbe.models.machine import AXES
+from abbe.service.audit.book import by_whom
 from abbe.service.campaigns.bar_places import BarPlaces, PlaceReadings
 from abbe.service.compensation.proved_levels import identity
 from abbe.service.compensation.pushing import Pushing, Questions, WantedTable
@@ -72,7 +73,7 @@ class CommissioningContext:
             return VerificationResult(False, f"{KIND}: {what} was read")  # a test step is never kept
 
         wanted = WantedTable(tables, now, lsb_nm, None, {"kind": KIND, "what": what})
-        await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, KIND, read, read))
+        await Pushing(self.session.controller, self.store, self.site).bring(wanted, Questions(list, by_whom(), read, read))
         if not found:
             raise TableMismatch(
                 "the controller or its tables changed before the ball-bar was read", "look at the controller, then begin again"

@@ -47,6 +47,9 @@ from abbe.service.site import Site
 from abbe.service.storage.store import Store
 from abbe.service.tables.nine_tables import Base, read_base
 
+BY_ITS_OWN_PUSH = ("BASE: ", "GENERATION: ", "SIGN: ", "GAIN: ", "PROMISE: ")
+"""What speaks against a proposal that is in force already, because it is."""
+
 
 @dataclass(frozen=True)
 class PushPrecheck:
@@ -82,8 +85,8 @@ class PushPrecheck:
         if drift_mm is not None and candidate.digest == content_digest(candidate):
             candidate = _drifted(candidate, drift_mm)
         found = [*self._bound(), *self._rejected(), *reasons_against(candidate, self.context, self.site.limits), *self._approved()]
-        if same := [reason for reason in found if reason.startswith("SAME: ")]:
-            return same  # whatever else has changed since came with this push
+        if any(reason.startswith("SAME: ") for reason in found):
+            found = [reason for reason in found if not reason.startswith(BY_ITS_OWN_PUSH)]
         if self.proposed.reasons and not found:
             found = [f"PROPOSED: {len(self.proposed.reasons)} reasons were against the table and no longer hold: propose again"]
         return found

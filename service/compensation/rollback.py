@@ -23,7 +23,7 @@ from abbe.service.devices.session import DeviceUrls, lock_machine, open_session
 from abbe.service.domain.progress import JobOutcome
 from abbe.service.domain.push_entry import TERMINAL, PushState
 from abbe.service.errors import AbbeError, MachineInUse, StillActive, TableMismatch, TableRefused
-from abbe.service.push.journal import Journal, facts
+from abbe.service.push.journal import BY_ROLLBACK, Journal, facts
 from abbe.service.push.operations import VerificationResult
 from abbe.service.sequences.control import Control
 from abbe.service.site import Site
@@ -108,7 +108,7 @@ async def rollback(
         return VerificationResult(not reasons(), why)
 
     by = by_whom() if request is None else request.who
-    questions = Questions(reasons, f"{by}: rollback", in_force_before, in_force_before)
+    questions = Questions(reasons, f"{by}{BY_ROLLBACK}", in_force_before, in_force_before)
     doc = {"kind": KIND, "to": to, "how": wanted.how, "by": by}
     if request is not None:
         doc |= {"reason": request.reason, "order": request.number}

@@ -140,9 +140,11 @@ def check_chain(entries: Sequence[PushEntry], head: str = GENESIS) -> None:
 
 
 NOT_YET = -1
-PUSHED_BY = "; pushed by "
-"""Separates approver and pusher in ``approved_by``; without it nobody else was asked, and the only name is that of the pusher."""
 """Stands for a number that no entry has stated yet. No controller reports it, so every comparison with it fails."""
+PUSHED_BY = "; pushed by "
+"""Separates approver and pusher in ``approved_by``; without it nobody else was asked, and the only name is that of who pushed."""
+BY_ROLLBACK = ": rollback"
+"""Follows the account in ``approved_by`` of a rollback."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,7 +21,7 @@ from abbe.service.domain.results import VerificationRecord
 from abbe.service.domain.run import Run
 from abbe.service.domain.solution_file import stored_solution
 from abbe.service.errors import NotStored, StoreError, TableMismatch
-from abbe.service.push.journal import NO_PUSH, NOT_YET, PUSHED_BY, JournalBroken, PushFacts, check_chain, facts, push_log
+from abbe.service.push.journal import BY_ROLLBACK, NO_PUSH, NOT_YET, PUSHED_BY, JournalBroken, PushFacts, check_chain, facts, push_log
 from abbe.service.rendering.document import Document, PictureBlock, ReportFigure, Section, Sign, TextTable
 from abbe.service.rendering.model import TableCurve
 from abbe.service.rendering.plots.tables import table_plot
@@ -231,6 +231,8 @@ def _who(approved_by: str) -> dict[str, str]:
     approver, _, pusher = approved_by.rpartition(PUSHED_BY)
     if approver or not pusher:
         return {"Approved by": approver, "Pushed by": pusher}
+    if pusher.endswith(BY_ROLLBACK):
+        return {"Rolled back by": pusher.removesuffix(BY_ROLLBACK)}
     return {"Pushed by": pusher, "Approval": "no second person was asked for"}
 
 

@@ -18,6 +18,8 @@ from abbe.service.verification.iso_readings import diagonal_groups, linear_group
 FAR = 10.0
 """Smallest distance of a far reading from its median, in pooled scatters. Of 20000 simulated tests with normal readings one reached it with
 6 groups of 3 readings, none with 10 or more groups; readings in whole steps with a scatter of 0.15 or 0.3 steps never came beyond 2."""
+APART = 3.0
+"""A far reading is also this many times as far from its median as the other readings of its group span: a position may scatter more."""
 LEAST_READINGS = 3
 LEAST_GROUPS = 6
 """Fewest groups (a group: one position, one direction) from which a scatter is known well enough."""
@@ -78,9 +80,10 @@ def _lines(rows: Sequence[_Row], head: str, unit: str) -> list[str]:
         return []
     off = [_off(group) for group in several]
     usual = _scatter(off, np.array([row.value for row in rows]))
-    far = [(d, row) for group, ds in zip(several, off, strict=True) for d, row in zip(ds, group, strict=True) if abs(d) > FAR * usual]
+    each = [(d, row, ds) for group, ds in zip(several, off, strict=True) for d, row in zip(ds, group, strict=True)]
+    far = [(d, row) for d, row, ds in each if abs(d) > max(FAR * usual, APART * _span_of_others(d, ds))]
     far.sort(key=lambda one: -abs(one[0]))
-    rest = f"from the median of this position and direction, where the others scatter by {plain(usual, 2)} {unit}"
+    rest = f"from the median of this position and direction, where all positions together scatter by {plain(usual, 2)} {unit}"
     out = [
         f"{head.format(row.where, tidy(row.place_mm))}, moving in {'+' if row.way > 0 else '-'}, "
         f"lies {plain(float(d))} {unit} {rest}: every figure uses it, look at it first"
@@ -88,6 +91,12 @@ def _lines(rows: Sequence[_Row], head: str, unit: str) -> list[str]:
     ]
     more = len(far) - MOST
     return [*out, f"{more} more readings lie as far from the others of their position and direction"] if more > 0 else out
+
+
+def _span_of_others(d: float, all_of_it: F1) -> float:
+    """Span of the other readings of a group; ``d``: the reading, ``all_of_it``: the group with it."""
+    others = np.delete(all_of_it, int(np.argmin(np.abs(all_of_it - d))))
+    return float(np.ptp(others))
 
 
 def _off(group: Sequence[_Row]) -> F1:
@@ -101,6 +110,6 @@ def _scatter(off: Sequence[F1], values: F1) -> float:
     The reading in the middle of an odd group is its median, and tells nothing about the scatter.
     """
     apart = np.sort(np.concatenate([np.sort(np.abs(d))[d.size % 2 :] for d in off]))
-    steps = np.diff(np.unique(values))
+    steps = np.diff(np.unique(np.delete(values, int(np.argmax(np.abs(values - np.median(values)))))))  # a blunder is no step
     step = float(steps[steps > 1e-4 * LEAST_UM].min(initial=np.inf))
     return max(float(apart[int(QUARTILE * (apart.size - 1))]) / NORMAL, step if np.isfinite(step) else 0.0, LEAST_UM)

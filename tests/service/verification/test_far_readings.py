@@ -93,3 +93,13 @@ def test_angles_beside_the_runs_are_looked_at_too() -> None:
 def test_the_lines_are_in_the_languages_of_reports(lang: str) -> None:
     lines = far_readings([cycles_of(ROWS, blunders={(k % 5, 0, k): 50.0 for k in range(8)})])
     assert not [line for line in lines if english(lang, phrase(lang, line), frozenset(lines))]
+
+
+def test_a_place_that_scatters_more_is_no_blunder() -> None:
+    rough = np.random.default_rng(5).normal(0.0, np.where(AT < 400.0, 0.1, 1.5), (5, 2, AT.size))
+    assert far_readings([cycles_of(rough)]) == []
+
+
+def test_among_equal_readings_the_only_other_one_is_named() -> None:
+    (line,) = far_readings([cycles_of(np.zeros((5, 2, AT.size)), blunders={(2, 1, 9): 100e3})])
+    assert "lies 100000 µm from the median" in line
