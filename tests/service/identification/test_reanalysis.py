@@ -22,7 +22,6 @@ from abbe.service.storage.store import Store
 from tests.conftest import Require
 from tests.many_campaigns import dask_cluster, fill
 
-pytestmark = pytest.mark.usefixtures("solved_once")
 SEEDS = (7, 8)
 LONG = os.environ.get("ABBE_TEST_LONG") == "1"
 
