@@ -48,7 +48,7 @@ class RtuLine:
             self._device.send(data)
 
 
-TICK_S = 0.01
+TICK_S = 0.005
 REST_S = 0.2
 """Time between two ticks while nothing streams or is buffered. This suffices because every request brings the world up to date."""
 AHEAD_S, AHEAD_SAMPLES = 10.0, 2000

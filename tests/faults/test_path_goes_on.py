@@ -136,6 +136,7 @@ async def test_a_bar_that_was_out_of_range_goes_on_before_that(place):
 async def test_going_on_costs_a_stretch_and_not_the_path(place):
     b, store = place
     plan = helix()
+    b.sim.pace(SPEED / 5.0)  # what the computer is late by counts as path: at full speed a tenth of a second is ten
     await broken(b, store, plan, 10.0)
     await resumed_item(b, store, plan)
     last = runs(store)[-1]

@@ -14,7 +14,8 @@ import pytest
 from abbe.drivers.api import BankState, Condition
 from abbe.drivers.cnc.driver import ModbusController
 from abbe.drivers.errors import DeviceFault, Refused
-from abbe.drivers.registry import open_controller
+from abbe.drivers.links.modbus_link import Canary, ModbusLink
+from abbe.drivers.links.urls import parse_url
 from abbe.drivers.second_decoder import read_axis_tables
 from abbe.drivers.tables import TableImage, crc32, encode
 from abbe.models.compensation.tables import NineTables
@@ -38,8 +39,11 @@ READY = Condition.REMOTE | Condition.REFERENCED | Condition.DRIVES_ON | Conditio
 
 @asynccontextmanager
 async def controller(machine: Instance) -> AsyncIterator[ModbusController]:
-    opened = await open_controller(f"modbus+tcp://127.0.0.1:{machine.port}")
+    """A link that waits longer for a reply than the product: the real-time tasks of LinuxCNC share the cores with other tests."""
+    url = parse_url(f"modbus+tcp://127.0.0.1:{machine.port}")
+    opened = ModbusController(await ModbusLink.connect(url, timeout_s=within(5.0), canary=Canary()))  # type: ignore[arg-type]
     try:
+        await opened.identify()
         yield opened
     finally:
         await opened.close()
